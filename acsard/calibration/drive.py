@@ -30,7 +30,7 @@ from acsard.core.messages.keys_and_roles import IMU
 from acsard.core.messages.schema import Imu, JointState, Odometry, PoseStamped, TwistStamped
 from acsard.core.values import NS_PER_S, Seconds
 from acsard.host import clock
-from acsard.host.errors import NotDrivenError
+from acsard.host.errors import NoAnswerError, NotDrivenError
 from acsard.terminal.prompt import Prompt
 
 POLL_S = 0.005  # a key takes effect within this time
@@ -42,6 +42,15 @@ MIN_SAMPLES = 20
 # How far the wheels may roll otherwise than commanded, m and rad, and as a share: more is an
 # obstacle, a speed limit or another command, and the robot could leave the floor.
 OFF, OFF_SHARE = (0.1, 0.2), 0.1
+CHECK_S = 0.5  # between two of these checks
+LAG_S = 1.0  # by which the wheels may be late meanwhile: their ramp, their response and the network
+
+# A pause of this program that keeps commands from the robot: they time out after 0.25 s by default.
+PAUSE_S = 0.2
+PAUSED = (
+    "this computer did not run the calibration for {:.1f} s, so the robot was not driven "
+    "meanwhile: end programs that keep the computer busy"
+)
 
 Values = Callable[[Any], tuple[float, ...]]
 
@@ -111,22 +120,30 @@ def place_and_yaw(message: PoseStamped | Odometry) -> tuple[float, ...]:
     return pose.position.x, pose.position.y, 2 * math.atan2(turn.z, turn.w)
 
 
-def require_path(move: Move, rows: Sequence[tuple[float, ...]], base: Base) -> None:
+def require_path(
+    move: Move, rows: Sequence[tuple[float, ...]], base: Base, driven: Seconds | None = None
+) -> None:
     """Raise `NotDrivenError` if the wheels did not roll the path of a move.
 
-    `rows` are the arrivals, stamps and speeds of the wheels since its start.
+    `rows` are the arrivals, stamps and speeds of the wheels since its start. `driven` is the time
+    since its first speed, or None after its end.
     """
     if not (move.linear or move.angular):
         return
     if len(rows) < MIN_SAMPLES:
+        if driven is not None:
+            return
         raise NotDrivenError("hardly any wheel speeds arrive: is the network or the board slow?")
     table = np.array(rows)
     steps = np.diff(table[:, 0])[:, None]
     rolled = ((table[1:, 2:] + table[:-1, 2:]) / 2 * steps).sum(axis=0)
     made = base.motion(np.zeros(ASIDE + 1), *rolled)
-    wanted = move.linear * move.seconds, move.angular * move.seconds
-    for seen, wish, off, unit in zip(made, wanted, OFF, ("m", "rad"), strict=True):
-        if abs(seen - wish) > off + OFF_SHARE * abs(wish):
+    least, most = (move.seconds,) * 2 if driven is None else (max(0.0, driven - LAG_S), driven)
+    commanded = move.linear, move.angular
+    for seen, speed, off, unit in zip(made, commanded, OFF, ("m", "rad"), strict=True):
+        wish = speed * most
+        near = sorted((speed * least, float(seen), wish))[1]
+        if abs(seen - near) > off + OFF_SHARE * abs(wish):
             raise NotDrivenError(
                 f"by its wheels the robot moved {float(seen):.2f} {unit}, although {wish:.2f} "
                 f"{unit} was commanded: is there a speed limit or an obstacle, does another "
@@ -157,6 +174,7 @@ class Recorder:
 
         self._wheels = self._sensor("wheel_states", (JointState,), speeds, ("left", "right"))
         self._others = [self._sensor("cmd_vel_out", (TwistStamped,), twist, APPLIED)]
+        self._received = self._pause = 0.0  # last call of `_receive`, longest pause before one
 
     def _sensor(
         self, key: str, types: tuple[type, ...], values: Values, columns: tuple[str, ...]
@@ -187,10 +205,24 @@ class Recorder:
         self._receive()
         for sensor in (self._wheels, *self._others):
             sensor.rows.clear()
+        self._pause = 0.0
+        try:
+            self._drive(leg)
+        except (NotDrivenError, NoAnswerError):
+            if self._pause > PAUSE_S:
+                raise NotDrivenError(PAUSED.format(self._pause)) from None
+            raise
+        for _ in self._standing(STANDS_S):
+            self._prompt.keys(POLL_S)
+        self._prompt.progress(1.0)
+        return self._run(leg.name)
+
+    def _drive(self, leg: Leg) -> None:
         done, shown = 0.0, -DISPLAY_S
+        base = Base.of(self._config.drive)
         for number, move in enumerate(leg.moves):
             by_key = leg.by_key and number == len(leg.moves) - 1
-            first = len(self._wheels.rows)
+            first, checked = len(self._wheels.rows), 0.0
             with closing(self._steps(move)) as steps:
                 for passed in steps:
                     if done + passed - shown >= DISPLAY_S:
@@ -200,29 +232,29 @@ class Recorder:
                         if by_key:
                             break
                         raise LogError("a key was pressed, so the drive has ended")
+                    if passed - checked >= CHECK_S:
+                        checked = passed
+                        require_path(move, self._wheels.rows[first:], base, passed)
                 else:
                     if by_key:
                         raise LogError(
                             "no key was pressed, although the robot must have turned a full "
                             "circle: start again, and press SPACE at the end of the circle"
                         )
-                    require_path(move, self._wheels.rows[first:], Base.of(self._config.drive))
+                    require_path(move, self._wheels.rows[first:], base)
             done += move.seconds
-        for _ in self._standing(STANDS_S):
-            self._prompt.keys(POLL_S)
-        self._prompt.progress(1.0)
-        return self._run(leg.name)
 
     def _steps(self, move: Move) -> Generator[Seconds, None, None]:
-        # Yields the seconds since the start of the move, often; the caller waits meanwhile.
+        # Yields the seconds since the first speed of the move, often; the caller waits meanwhile.
         if not (move.linear or move.angular):
             yield from self._standing(move.seconds)
             return
-        begun, driver = clock.steady_s(), Driver(self._client)
+        driver = Driver(self._client)
         try:
             for wait_s in drive(move.linear, move.angular, move.seconds)(driver):
                 for _ in self._standing(wait_s):
-                    yield min(move.seconds, clock.steady_s() - begun)
+                    begun, now = driver.ride.begun, clock.steady_s()
+                    yield 0.0 if begun is None else min(move.seconds, now - begun)
         finally:
             for pause_s in driver.zeros():
                 time.sleep(pause_s)
@@ -236,6 +268,7 @@ class Recorder:
 
     def _receive(self) -> None:
         now = clock.steady_s()
+        self._pause, self._received = max(self._pause, now - self._received), now
         for sensor in (self._wheels, *self._others):
             sensor.receive(now)
 

@@ -100,10 +100,11 @@ def drive(
                 )
             try:
                 return recorder.ride(leg)
-            except NotDrivenError as error:
+            except NotDrivenError:
                 with suppress(NoAnswerError):  # the reason is known, also if a query is late
-                    if client.get("state").mode in NEVER_DRIVING_MODES:
-                        raise LogError(str(error)) from None
+                    state = client.get("state")
+                    if state.mode in NEVER_DRIVING_MODES:
+                        raise LogError(state.why) from None
                 raise
             except NoAnswerError as error:
                 client.get("info")  # raises if the daemon is still silent
@@ -173,10 +174,8 @@ def _repeated(leg: Leg, words: str, prompt: Prompt, ride: Ride) -> Run:
         except NotDrivenError as error:
             if not left:
                 raise
-            prompt.show_text(
-                f"This leg was disturbed: {error}\nPut the robot back where and how the leg began. "
-                "Then start it again."
-            )
+            prompt.show_text(f"This leg was disturbed: {error}")
+            prompt.instruct("Put the robot back where and how the leg began. Then start it again.")
     raise AssertionError
 
 

@@ -89,6 +89,9 @@ class Prompt:
     def show_text(self, text: str) -> None:
         self._print(f"\n{_wrapped(text)}\n")
 
+    def instruct(self, text: str) -> None:
+        """Show what the person must do, if there is one."""
+
     def doing(self, text: str) -> None:
         if self._on and has_room(sys.stderr):
             # Cut the line and never wrap it, because a wrapped line cannot be overwritten.
@@ -159,6 +162,9 @@ class TerminalPrompt(Prompt):
                 if word in answers:
                     return word
                 self._print(f"   please type {' or '.join(answers)}; {QUIT_KEY} quits\n")
+
+    def instruct(self, text: str) -> None:
+        self.show_text(text)
 
     def start(self, text: str) -> None:
         self.show_text(text)

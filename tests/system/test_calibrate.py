@@ -360,6 +360,9 @@ def test_on_the_simulator_a_process_suspended_for_1_5_s_does_not_end_the_calibra
             process.send_signal(signal.SIGCONT)
             assert program.ended(2 * RIDES_S) == 0, program.stderr
         assert "was disturbed" in program.stderr
+        assert "Put the robot back" not in program.stderr
+        if stalled == "calibration":
+            assert "this computer did not run the calibration for 1." in program.stderr
         results = json.loads(program.stdout)
     assert abs(results["found"]["wheel_separation_multiplier"] - 1.6) < 0.05
 

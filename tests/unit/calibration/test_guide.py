@@ -126,6 +126,29 @@ def test_wheels_that_do_not_roll_the_commanded_path_disturb_the_leg(
     require_path(Move(1.0), [], base)
 
 
+@pytest.mark.parametrize(
+    ("move", "speeds", "words"),
+    [
+        (Move(4.0, 0.3), (6.0, 6.0), ""),
+        (Move(4.0, 0.3), (0.0, 0.0), ""),  # not yet
+        (Move(4.0, -0.3), (-3.0, -3.0), ""),
+        (Move(4.0, 0.3), (12.0, 12.0), "moved 0.60 m, although 0.30 m"),
+        (Move(4.0, 0.3), (-6.0, -6.0), "moved -0.30 m"),
+        (Move(4.0, 0.3), (5.0, 7.0), "rad, although 0.00 rad"),
+    ],
+)
+def test_wheels_that_roll_another_path_disturb_the_leg_before_its_end(
+    move: Move, speeds: tuple[float, float], words: str
+) -> None:
+    rows = [(0.02 * n, 0.0, *speeds) for n in range(51)]
+    base = Base.of(Config().drive)
+    if words:
+        with pytest.raises(NotDrivenError, match=words):
+            require_path(move, rows, base, 1.0)
+    else:
+        require_path(move, rows, base, 1.0)
+
+
 def test_two_turns_instead_of_one_are_noticed() -> None:
     robot = Robot(1.0, radius=0.0165)
     with pytest.raises(LogError, match=r"should have made one full turn, but by its wheels"):
