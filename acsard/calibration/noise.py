@@ -8,14 +8,14 @@ of ratio and track that last for a whole window. The shares are the non-negative
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 
 import numpy as np
 import numpy.typing as npt
 from msgspec import Struct
 
 from acsard.calibration.fit import AHEAD, ASIDE, BIAS, GYRO_DELAY, POSE_DELAY, SCALE, Fit, Piece
-from acsard.calibration.log import Complexes, Floats, Run
+from acsard.calibration.log import Floats
 from acsard.core.config.settings import OdometryConfig
 from acsard.core.values import Seconds
 
@@ -24,12 +24,8 @@ SHORTEST = 0.7  # of a window at the end of a run, as a fraction
 MIN_WINDOWS, FOLDS = 20, 5
 LEAST_ROLL_M, LEAST_WAY_M = 1e-3, 0.02
 STRAIGHT = 0.8  # way / rolled path of a window that shows an error of the distance
-MIN_CHORD_M = 0.15  # of half a window, to take a direction from positions
 OUTLIER = 9.0  # variances of a squared error, above which it counts as this
 MEDIAN = 0.455  # of a chi-square of one degree of freedom, whose mean is 1
-# Directions between positions show less of a heading's error than headings do. With simulated
-# robots, the heading's variance was stated up to six times too small without this factor.
-BY_POSITIONS = 2.5
 FLOOR = 1e-7  # of a variance per metre or radian
 SURE = 2.0
 
@@ -49,15 +45,15 @@ class Noise(Struct, frozen=True):
     distance_better: bool
 
 
-def noise(runs: Sequence[Run], fit: Fit, odometry: OdometryConfig) -> Noise:
-    """Return the noise that the runs of a fit show, and whether it describes them better."""
+def noise(fit: Fit, odometry: OdometryConfig) -> Noise:
+    """Return the noise that the runs of a fit show, and whether it describes them better.
+
+    Positions without headings show only the noise of the distance. Fits of the heading's noise to
+    the directions between positions stated a tenth of the variance, or less.
+    """
     headings, distances = _Rows(), _Rows()
-    # In short pieces, the errors of positions would hide those of the wheels.
-    parts = list(zip(fit.pieces, fit.left_out, strict=True))
-    if not {"gyro", "headings"} & set(fit.sensors):
-        parts = [(Piece(run, fit.base), fit.p) for run in runs]
-    whole, passed = sum(piece.run.seconds for piece, _ in parts) + 1e-9, 0.0
-    for piece, p in parts:
+    whole, passed = sum(piece.run.seconds for piece in fit.pieces) + 1e-9, 0.0
+    for piece, p in zip(fit.pieces, fit.left_out, strict=True):
         for begin, heading, distance in _windows(piece, p):
             group = int(FOLDS * (passed + begin - piece.t[0]) / whole)
             headings.add(heading, group)
@@ -75,9 +71,8 @@ def noise(runs: Sequence[Run], fit: Fit, odometry: OdometryConfig) -> Noise:
     ])  # fmt: skip
     by_distance, distance_better = _fitted(distances, stated)
     a, b, c, d = (float(v) for v in by_heading[:SENSOR])
-    if not {"gyro", "headings"} & set(fit.sensors):
-        a, b, c, d = (BY_POSITIONS * share for share in (a, b, c, d))
-    known, seen = (len(rows.groups) > MIN_WINDOWS for rows in (headings, distances))
+    # Zeros mean that the errors of the sensor hide those of the wheels.
+    known, seen = by_heading[:SENSOR].any(), by_distance[:SENSOR].any()
     return Noise(
         max(a, FLOOR) if known else None, max(b, FLOOR) if known else None, c, d,
         max(float(by_distance[ROLL]), FLOOR) if seen else None, float(by_distance[ROLL_SQUARED]),
@@ -103,21 +98,19 @@ def _windows(piece: Piece, p: Floats) -> Iterator[tuple[Seconds, Row | None, Row
             continue
         length = min(length, float(t[-1] - t[0]))
         for begin in np.arange(t[0], t[-1] - SHORTEST * length, length):
-            ends = np.array([begin, begin + length / 2, min(begin + length, t[-1])])
+            ends = np.array([begin, min(begin + length, t[-1])])
             row = far = None
             if piece.gyro:
-                late = ends[[0, 2]] + p[GYRO_DELAY]
+                late = ends + p[GYRO_DELAY]
                 seen = np.diff(np.interp(late, run.gyro_t, run.turned) - p[BIAS] * late)[0]
-                row = _heading(path, ends[[0, 2]], seen * math.exp(p[SCALE]))
+                row = _heading(path, ends, seen * math.exp(p[SCALE]))
             elif len(run.yaw_t):
                 # At the samples themselves: between them, the heading is unknown.
-                at = _nearest(run.yaw_t, ends[[0, 2]] + p[POSE_DELAY])
+                at = _nearest(run.yaw_t, ends + p[POSE_DELAY])
                 row = _heading(path, run.yaw_t[at] - p[POSE_DELAY], np.diff(run.yaw[at])[0])
             if len(run.place_t) > 2:
                 at = _nearest(run.place_t, ends + p[POSE_DELAY])
-                chords = np.diff(run.place[at])
-                far, turned = _distance(path, run.place_t[at] - p[POSE_DELAY], chords)
-                row = row or turned
+                far = _distance(path, run.place_t[at] - p[POSE_DELAY], np.diff(run.place[at])[0])
             yield float(begin), row, far
 
 
@@ -146,21 +139,12 @@ def _heading(path: Path, t: Floats, seen: float) -> Row | None:
     return [roll, spin, way**2, roll**2, 1.0, off**2] if roll > LEAST_ROLL_M else None
 
 
-def _distance(path: Path, t: Floats, chords: Complexes) -> tuple[Row | None, Row | None]:
-    # Return the rows of the distance, and of the turn between the chords of two halves.
-    heading, rolled, turned, x, y = path.at(t)
-    wheels, far, way = np.diff(x + 1j * y), None, None
-    roll = float(rolled[-1] - rolled[0])
-    if abs(wheels.sum()) > max(LEAST_WAY_M, STRAIGHT * roll):
-        off = float(abs(chords.sum()) - abs(wheels.sum()))
-        far = [roll, 0.0, 0.0, roll**2, 1.0, off**2]
-    if np.abs(wheels).min() > MIN_CHORD_M:
-        turn = chords[1] * np.conj(chords[0]) * np.conj(wheels[1]) * wheels[0]
-        turn_2 = float(heading[-1] - heading[0]) ** 2 / 4
-        sensor = float((1 / np.abs(wheels) ** 2).sum())
-        way = [roll / 2, float(turned[-1] - turned[0]) / 2, turn_2, roll**2 / 4, sensor,
-               float(np.angle(turn)) ** 2]  # fmt: skip
-    return far, way
+def _distance(path: Path, t: Floats, chord: complex) -> Row | None:
+    _, (begin, end), _, x, y = path.at(t)
+    way, roll = float(np.hypot(np.diff(x), np.diff(y))[0]), float(end - begin)
+    if way <= max(LEAST_WAY_M, STRAIGHT * roll):
+        return None
+    return [roll, 0.0, 0.0, roll**2, 1.0, (abs(chord) - way) ** 2]
 
 
 def _fitted(rows: _Rows, stated: Floats) -> tuple[Floats, bool]:

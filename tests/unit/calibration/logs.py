@@ -18,6 +18,9 @@ IDEAL = {
 }  # fmt: skip
 """Overrides for a robot that moves exactly as the model says and has perfect sensors."""
 
+WAYS = {"gyro": (True, False), "positions": (False, True), "both": (True, True)}
+"""Whether the log of a simulated robot has the turn rate of a gyro, and positions."""
+
 
 def ideal(plan: Plan = GUIDED) -> Drive:
     return drive(replace(Robot(), **IDEAL), plan)  # type: ignore[arg-type]

@@ -15,7 +15,7 @@ from msgspec import structs
 from acsard.calibration.fit import BIAS, GYRO_DELAY, fit, gyro_bias
 from acsard.calibration.log import LogError, TapeReading
 from acsard.core.config.settings import Config, DriveConfig
-from tests.unit.calibration.logs import fitted, ideal, multipliers, run, runs, usual
+from tests.unit.calibration.logs import WAYS, fitted, ideal, multipliers, run, runs, usual
 from tests.unit.calibration.robots import (
     GUIDED,
     RADIUS,
@@ -29,7 +29,6 @@ from tests.unit.calibration.robots import (
     wander,
 )  # fmt: skip
 
-WAYS = {"gyro": (True, False), "positions": (False, True), "both": (True, True)}
 each_way = pytest.mark.parametrize("way", WAYS)
 
 
