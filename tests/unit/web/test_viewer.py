@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import asyncio
 import json
+from collections.abc import AsyncIterator
 from types import SimpleNamespace
 from typing import Any, cast
-from unittest.mock import Mock
+from unittest.mock import AsyncMock, Mock
 
 import aiohttp
 import pytest
@@ -122,7 +123,8 @@ class Page:
         parts = Parts(robot, counts)
         parts.calls.call = self._call  # type: ignore[method-assign, assignment]
         who = AdmittedClient(role, "bob", "token", "1.2.3.4")
-        socket, request = cast(Any, SimpleNamespace()), cast(Any, SimpleNamespace(transport=None))
+        socket: Any = SimpleNamespace(send_frame=AsyncMock())
+        request: Any = SimpleNamespace(transport=None)
         self.viewer, self.counts = Viewer(socket, request, who, parts, camera=False), counts
 
     async def _call(self, who: object, verb: str, payload: object) -> ServiceReply:
@@ -152,6 +154,27 @@ async def test_an_invalid_message_without_a_stop_is_only_refused() -> None:
     await page.take('{"call": "clear", "id": null}')
     assert page.stops == []
     assert page.counts.refused() == {"malformed": 1}
+
+
+async def test_a_flood_of_messages_leaves_each_other_client_its_turn() -> None:
+    page, turns = Page("viewer"), 0
+
+    async def flood() -> AsyncIterator[Any]:
+        for _ in range(1000):
+            yield SimpleNamespace(type=aiohttp.WSMsgType.PONG, data=b"")
+
+    async def take_turns() -> None:
+        nonlocal turns
+        while True:
+            await asyncio.sleep(0)
+            turns += 1
+
+    page.viewer._socket = cast(Any, flood())
+    other = asyncio.create_task(take_turns())
+    async with asyncio.timeout(PATIENCE_S):
+        await page.viewer.run()
+    other.cancel()
+    assert turns > 900
 
 
 async def test_every_press_is_answered_by_a_stop_that_was_sent_after_it() -> None:
