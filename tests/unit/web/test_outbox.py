@@ -44,6 +44,12 @@ def bus() -> Iterator[Bus]:
     bus.free.set()
 
 
+def suspend(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let an hour pass in which the monotonic clock stands still."""
+    asleep_ns = clock.asleep_ns() + 3600 * NS_PER_S
+    monkeypatch.setattr(clock, "asleep_ns", lambda: asleep_ns)
+
+
 def test_only_the_newest_wish_is_sent_after_the_bus_was_blocked(bus: Bus) -> None:
     outbox, blocker, relay = Outbox(), Relay(), Relay()
     bus.block()
@@ -78,13 +84,11 @@ def test_a_speed_that_waited_during_a_suspend_is_dropped(
     bus: Bus, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The age of a command must include the suspend, in which the monotonic clock stands still."""
-    asleep_ns = 0
-    monkeypatch.setattr(clock, "asleep_ns", lambda: asleep_ns)
     dropped: list[bool] = []
     outbox, relay = Outbox(lambda: dropped.append(True)), Relay()
     with outbox._news:  # the thread cannot send the command before the suspend
         outbox.take(relay, bus.put, AHEAD)
-        asleep_ns = 3600 * NS_PER_S
+        suspend(monkeypatch)
     outbox.flush(PATIENCE_S)
     assert bus.sent == []
     assert dropped == [True]
@@ -93,12 +97,10 @@ def test_a_speed_that_waited_during_a_suspend_is_dropped(
 def test_no_zero_is_sent_for_a_drive_that_ended_before_a_suspend(
     bus: Bus, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    asleep_ns = 0
-    monkeypatch.setattr(clock, "asleep_ns", lambda: asleep_ns)
     outbox, relay = Outbox(), Relay()
     outbox.take(relay, bus.put, AHEAD)
     outbox.flush(PATIENCE_S)
-    asleep_ns = 3600 * NS_PER_S
+    suspend(monkeypatch)
     outbox.release(relay, 0.25)
     outbox.flush(PATIENCE_S)
     assert bus.sent == [AHEAD]
