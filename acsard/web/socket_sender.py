@@ -160,11 +160,6 @@ class Outgoing:
         with suppress(ConnectionError):
             await self._socket.send_frame(payload, aiohttp.WSMsgType.CLOSE)
 
-    def cut(self) -> None:
-        """End the connection without a reason."""
-        self._closing = True
-        cut(self._transport)
-
     def pong(self, data: bytes) -> None:
         """Queue the answer to a ping.
 
