@@ -15,6 +15,7 @@ from contextlib import suppress
 from email.message import Message
 
 import aiohttp
+from aiohttp.http import HttpProcessingError
 from msgspec import Struct
 
 from acsard.core.values import NS_PER_S, Ns
@@ -29,6 +30,9 @@ CONNECT_S, SILENT_S = 3.0, 3.0
 
 # A full HD picture has a few hundred kB.
 MAX_PICTURE, READ_BYTES = 1_000_000, 65536
+
+# Of a connection, and of aiohttp's parser for a stream that is damaged or is not MJPEG.
+STREAM_ERRORS = (aiohttp.ClientError, HttpProcessingError, OSError, ValueError)
 
 # The page in the browser waits no longer.
 SEND_TIMEOUT_S = 5.0
@@ -108,7 +112,7 @@ class Camera:
             while not self._idle():
                 try:
                     await self._read(session)
-                except Exception as error:  # noqa: BLE001 - whatever the camera sends
+                except STREAM_ERRORS as error:
                     detail = str(error) or "no answer"
                     self._trouble = ("the camera's stream cannot be read", detail)
                     self.newest = None  # clients get the reason instead of an old picture

@@ -8,11 +8,10 @@ from unittest.mock import Mock
 
 import pytest
 from aiohttp import StreamReader
-from aiohttp.http import HttpProcessingError
 
 from acsard.core.values import NS_PER_S
 from acsard.host import clock
-from acsard.web.camera import Camera, pictures
+from acsard.web.camera import STREAM_ERRORS, Camera, pictures
 from tests.each import each
 
 PICTURES = [bytes([0xFF, 0xD8, n]) * (n + 1) + b"\r\n--\r\n\r\n" for n in range(5)]
@@ -65,8 +64,24 @@ async def test_every_picture_is_found_in_pieces_of_any_size(
     ],
 )
 async def test_a_stream_that_would_fill_the_memory_is_an_error(stream: bytes, why: str) -> None:
-    with pytest.raises((ValueError, HttpProcessingError), match=why):
+    with pytest.raises(STREAM_ERRORS, match=why):
         await read("frame", stream, 65536)
+
+
+@each(
+    "part",
+    [
+        b"Content-Length: 9\r\n\r\nabc",
+        b"Content-Length: -9\r\n\r\nabc",
+        b"no header\r\n\r\nabc",
+        b"\xff: \xff\r\n\r\nabc",
+        b"A: b\r\n" * 500 + b"\r\n",
+        b"Content-Type: multipart/mixed\r\n\r\n--x",
+    ],
+)
+async def test_a_damaged_stream_is_an_error_that_the_camera_expects(part: bytes) -> None:
+    with pytest.raises(STREAM_ERRORS):
+        await read("frame", b"--frame\r\n" + part)
 
 
 async def test_an_answer_that_is_not_a_stream_is_an_error() -> None:
