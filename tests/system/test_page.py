@@ -189,7 +189,7 @@ def test_without_a_connection_stop_and_settings_are_grey_and_the_page_says_why(p
     browser = page.browser
     browser.tap("tab-set")
     browser.js("document.getElementById('reset').click()")
-    page.shows("set-told", "pose is x 0")
+    page.shows("set-answer", "pose is x 0")
     until(lambda: browser.js(SETTINGS), 5.0, "the settings can be changed")
     assert browser.js(RED)
     page.server.process.kill()
@@ -691,7 +691,7 @@ def test_settings_and_activation_on_the_page_reach_the_robot(page: Phone) -> Non
     browser.tap("tab-set")
     until(lambda: browser.js(SET), 5.0, "the setting is there")
     until(lambda: bus.get("config")["limits"]["linear_speed"] == 0.31, 5.0, "it is set")
-    page.shows("set-told", "0.31")
+    page.shows("set-answer", "0.31")
     browser.js("document.getElementById('deactivate').click()")
     page.shows("mode", "INACTIVE")
     browser.js("document.getElementById('activate').click()")

@@ -175,7 +175,7 @@ def test_the_alarm_calls_a_stop_unconfirmed_until_the_robot_has_answered_one(
     browser.js("stopping.press(); stopping.over()")
     shows(browser, "alarm", "STOP was not confirmed")
     clicked(browser, "reset")
-    shows(browser, "set-told", "pose is x 0")
+    shows(browser, "set-answer", "pose is x 0")
     clicked(browser, "deactivate")
     shows(browser, "mode", "INACTIVE")
     bus.get("srv/stop")

@@ -59,10 +59,10 @@ export function barred(hello, what) {
 export function permit(hello, absent, needless = {}) {
   const sets = barred(hello, "set");
   text("barred", barred(hello, "drive") || absent || (sets && `Settings are ${sets}.`));
-  for (const one of document.querySelectorAll("[data-does]")) {
-    const why = barred(hello, one.dataset.does) || absent || needless[one.dataset.does] || "";
-    if ("disabled" in one) one.disabled = Boolean(why);
-    else one.setAttribute("aria-disabled", String(Boolean(why)));
-    if (one.title !== why) one.title = why;
+  for (const control of document.querySelectorAll("[data-does]")) {
+    const why = barred(hello, control.dataset.does) || absent || needless[control.dataset.does] || "";
+    if ("disabled" in control) control.disabled = Boolean(why);
+    else control.setAttribute("aria-disabled", String(Boolean(why)));
+    if (control.title !== why) control.title = why;
   }
 }

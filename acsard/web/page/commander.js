@@ -80,7 +80,7 @@ function objection(state, source, sender) {
 }
 
 function ranked(state, source) {
-  return state.sources.find((one) => one.name === source);
+  return state.sources.find(({ name }) => name === source);
 }
 
 export class Commander {
@@ -120,8 +120,8 @@ export class Commander {
   }
 
   /** Return {send, ended}: the command to send now and, if the hold has ended, the reason. Both may be missing.
-   *  `heard` is the time at which `state` was true. */
-  look(now, state, heard, source, sender) {
+   *  `stateTime` is the time at which `state` was true. */
+  look(now, state, stateTime, source, sender) {
     if (!this.held) return {};
     if (now - this.#looked > FROZEN) return { send: this.release(), ended: "This page was suspended: press again." };
     if (now - this.#looked > HICCUP) this.#open(now);
@@ -129,7 +129,7 @@ export class Commander {
     const why = objection(state, source, sender);
     if (state && NEVER.includes(state.mode)) return { send: this.release(), ended: why };
     // A state from before the hold began cannot show that the robot follows it.
-    if (!why && heard > this.#begun) {
+    if (!why && stateTime > this.#begun) {
       this.#fine = now;
       this.phase = "driving";
     }

@@ -17,7 +17,7 @@ const STRANGE =
 export class Drive {
   #commander = new Commander();
   #link;
-  #told;
+  #hint;
   #timer = null;
   #again = null;
   #by = null; // the input that drives: "stick", "keys" or "pad"; only this input can release
@@ -29,7 +29,7 @@ export class Drive {
   #padStrange = false; // the hint about an unknown gamepad was shown
   #awake = null; // the lock that keeps the screen on, as a promise; a locked screen hides the page, which releases
   state = null;
-  heard = -Infinity; // time at which `state` was true, by performance.now()
+  stateTime = -Infinity; // time at which `state` was true, by performance.now()
   sender = "";
   limits = { linear: 0, angular: 0 };
   limit = 0.2;
@@ -37,9 +37,9 @@ export class Drive {
   barred = "no connection yet"; // why a push would not move the robot, in words
   shown = true; // the view with the stick is visible
 
-  constructor(link, stick, knob, told) {
+  constructor(link, stick, knob, hint) {
     this.#link = link;
-    this.#told = told;
+    this.#hint = hint;
     this.stick = stick;
     this.knob = knob;
     this.#listen();
@@ -67,7 +67,7 @@ export class Drive {
     if (!this.allowed || this.barred || !this.shown || this.#commander.held) return;
     clearTimeout(this.#again);
     this.#by = by;
-    this.#told("");
+    this.#hint("");
     this.#commander.press(performance.now());
     this.stick.classList.add("held");
     // Without HTTPS or with a low battery the browser refuses, and the screen locks as usual.
@@ -81,7 +81,7 @@ export class Drive {
   #look() {
     this.stick.classList.toggle("follows", this.#commander.phase === "driving");
     this.#commander.wish(...twist(...this.#push, this.limit, this.limits));
-    const { send, ended } = this.#commander.look(performance.now(), this.state, this.heard, SOURCE, this.sender);
+    const { send, ended } = this.#commander.look(performance.now(), this.state, this.stateTime, SOURCE, this.sender);
     if (send) this.#send(send);
     if (ended === undefined) return;
     this.#rest();
@@ -99,7 +99,7 @@ export class Drive {
     this.#again = setTimeout(() => !document.hidden && performance.now() < last && this.#send(ZERO), TWICE);
     this.stick.classList.remove("held", "follows");
     this.#awake?.then((lock) => lock?.release());
-    this.#told(why);
+    this.#hint(why);
   }
 
   /** Send a command. A release is sent even over a congested connection. */
@@ -194,10 +194,10 @@ export class Drive {
   #pad() {
     // Only the standard mapping is used. On other gamepads the axes are unknown, and a trigger at rest may
     // read as full lock.
-    const pads = [...(navigator.getGamepads?.() ?? [])].filter((one) => one?.connected);
-    const pad = pads.find((one) => one.mapping === "standard");
+    const pads = [...(navigator.getGamepads?.() ?? [])].filter((pad) => pad?.connected);
+    const pad = pads.find(({ mapping }) => mapping === "standard");
     const strange = !pad && pads.length > 0;
-    if (strange && !this.#padStrange && this.allowed) this.#told(STRANGE);
+    if (strange && !this.#padStrange && this.allowed) this.#hint(STRANGE);
     this.#padStrange = strange && this.allowed;
     const held = pad ? SHOULDERS.some((n) => pad.buttons[n]?.pressed) : false;
     if (this.#by === "pad") {

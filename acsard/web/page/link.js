@@ -11,7 +11,7 @@ export class Link {
   #wanted = new Map();
   #answers = new Map();
   #number = 0;
-  #heard = 0;
+  #received = 0;
   #asked = null; // send time of the ping that has no answer yet
   #refused;
   #takers;
@@ -73,7 +73,7 @@ export class Link {
     const id = ++this.#number;
     return new Promise((done) => {
       const given = setTimeout(() => this.#unanswered(id, "no answer within 3 s"), 3000);
-      this.#answers.set(id, (told) => (clearTimeout(given), done(told)));
+      this.#answers.set(id, (answer) => (clearTimeout(given), done(answer)));
       if (this.open) this.urge({ call: verb, payload, id });
       else this.#unanswered(id, "no connection to the robot");
     });
@@ -89,7 +89,7 @@ export class Link {
       this.open = true;
       this.beat = null;
       this.#tries = 0;
-      this.#heard = performance.now();
+      this.#received = performance.now();
       this.#asked = null;
       for (const asked of this.#wanted.values()) this.send(asked);
       this.#takers.up();
@@ -107,7 +107,7 @@ export class Link {
   }
 
   #take(message) {
-    this.#heard = performance.now();
+    this.#received = performance.now();
     if ("pong" in message) {
       // A ping that was repeated before its answer gets several answers; only the first counts.
       if (message.pong !== this.#asked) return;
@@ -130,7 +130,7 @@ export class Link {
 
   #ping() {
     if (!this.open) return;
-    if (performance.now() - this.#heard > SILENT) {
+    if (performance.now() - this.#received > SILENT) {
       this.#end("the robot does not answer");
       this.#connect();
       return;

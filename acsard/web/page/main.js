@@ -38,7 +38,7 @@ const complain = notice((words) => {
   views.text("complaint", ""); // a screen reader announces a repeated message only if the text changes
   views.text("complaint", words);
 });
-const told = notice((words) => {
+const hint = notice((words) => {
   note = words;
   readied();
 });
@@ -53,18 +53,18 @@ const link = new Link(refused, {
   events: ({ value }) => views.happened($("happened"), value),
   path: ({ path }) => map.trail(path),
   minute: ({ minute }) => plots.begin(performance.now(), minute),
-  refused: ({ reason }) => told(reason),
+  refused: ({ reason }) => hint(reason),
   gone: ({ gone }) => (silent = gone),
   up: connected,
   down: disconnected,
 });
 const map = new PathMap($("map"));
-const drive = new Drive(link, $("stick"), $("knob"), told);
+const drive = new Drive(link, $("stick"), $("knob"), hint);
 const camera = new Camera($("camera"));
 const plots = new Minute();
 let view = "drive";
 let state = null;
-let heard = -Infinity; // time at which `state` was true, by performance.now()
+let stateTime = -Infinity; // time at which `state` was true, by performance.now()
 let hello = null;
 let wished = null;
 let tried = false; // a connection was attempted
@@ -85,10 +85,10 @@ function settable() {
 
 function open(name) {
   view = name;
-  for (const one of VIEWS) {
-    $(one).hidden = one !== view;
-    $(`tab-${one}`).setAttribute("aria-selected", String(one === view));
-    $(`tab-${one}`).tabIndex = one === view ? 0 : -1;
+  for (const tab of VIEWS) {
+    $(tab).hidden = tab !== view;
+    $(`tab-${tab}`).setAttribute("aria-selected", String(tab === view));
+    $(`tab-${tab}`).tabIndex = tab === view ? 0 : -1;
   }
   drive.shown = view === "drive";
   if (!drive.shown) drive.release();
@@ -96,7 +96,7 @@ function open(name) {
   else link.unsubscribe("diagnostics");
   if (view === "events") listed();
   if (view === "set") {
-    views.text("set-told", ""); // the note of an earlier button is outdated
+    views.text("set-answer", ""); // the note of an earlier button is outdated
     configured();
   }
   map.redraw();
@@ -107,10 +107,10 @@ async function asked(verb, payload) {
 }
 
 /** Show the answer to a button, and return it: a failure in every view. */
-function answered(told) {
-  complain(told.ok ? "" : told.text);
-  views.text("set-told", told.ok ? told.text : "");
-  return told;
+function answered(answer) {
+  complain(answer.ok ? "" : answer.text);
+  views.text("set-answer", answer.ok ? answer.text : "");
+  return answer;
 }
 
 /** Return a function that shows a message by `show` until the person has had time to read it. */
@@ -161,11 +161,11 @@ function lasts() {
 
 /** Return whether the state that this page shows is not fresh any more. */
 function dated() {
-  return Boolean(state) && performance.now() - heard > lasts();
+  return Boolean(state) && performance.now() - stateTime > lasts();
 }
 
 function looked() {
-  const old = link.open ? Math.max(performance.now() - heard, link.lag) : Infinity;
+  const old = link.open ? Math.max(performance.now() - stateTime, link.lag) : Infinity;
   const none = link.open ? "waiting" : tried ? "no connection" : "connecting";
   views.freshness(old, lasts(), link.way, none, seen, Boolean(state) && !boarded(state));
   if (link.open && (dated() || (silent && !state))) views.unheard(silent);
@@ -186,7 +186,7 @@ function offered() {
  *  nothing is received from the robot. */
 function permitted() {
   const before = absent;
-  absent = !state || performance.now() - heard > 2 * lasts();
+  absent = !state || performance.now() - stateTime > 2 * lasts();
   permit(hello, absent ? ABSENT : "", NEEDLESS[state?.mode]);
   if (before && !absent && view === "set") configured();
 }
@@ -226,18 +226,18 @@ async function pressed(event) {
   if (since < SETTLED) return answered({ ok: false, text: HASTY });
   const ended = state.mode;
   const press = stopping.over();
-  const told = await released(ended === "inactive" ? "activate" : "clear", ended);
-  if (ended === "stopped" && told.ok) stopping.released(press);
+  const answer = await released(ended === "inactive" ? "activate" : "clear", ended);
+  if (ended === "stopped" && answer.ok) stopping.released(press);
 }
 
 function stated({ value, age }) {
   // A state from long before this page opened says nothing about the present.
   if (!state && age > 2 * lasts()) return;
   if (state && state.mode !== value.mode) complain("");
-  if (state?.mode !== value.mode && value.mode in RELEASE) told("");
+  if (state?.mode !== value.mode && value.mode in RELEASE) hint("");
   seen = true;
   state = drive.state = value;
-  heard = drive.heard = performance.now() - age;
+  stateTime = drive.stateTime = performance.now() - age;
   silent = "";
   views.banner(state, Boolean(hello?.barred.clear), hello?.sender);
   offered();
@@ -248,10 +248,10 @@ function stated({ value, age }) {
   const { linear, angular } = state; // null without feedback from the board
   dialled();
   const late = state.latencies.period_lateness?.last_minute;
-  plots.late.add(heard, late ? late.p99 / 1000 : null, late ? late.max / 1000 : null);
-  plots.volts.add(heard, state.battery?.volts);
-  plots.speed.add(heard, linear, null);
-  plots.turn.add(heard, angular, null);
+  plots.late.add(stateTime, late ? late.p99 / 1000 : null, late ? late.max / 1000 : null);
+  plots.volts.add(stateTime, state.battery?.volts);
+  plots.speed.add(stateTime, linear, null);
+  plots.turn.add(stateTime, angular, null);
   if (view !== "status") return;
   views.sources($("sources"), state, hello?.sender);
   views.counters($("counters"), state);
@@ -290,7 +290,7 @@ function greeted(message) {
   $("limit").max = String(hello.limits.linear);
   limited();
   offered();
-  if (uninvited) told(uninvited); // an earlier token still gave access
+  if (uninvited) hint(uninvited); // an earlier token still gave access
   uninvited = "";
   if (hello.simulated) link.subscribe("sim/pose", 5);
 }
@@ -308,9 +308,9 @@ async function refused() {
 /** Resolve to the answer to a STOP. `called` is its call over the WebSocket. If this call is not answered within
  *  `SOON`, the STOP is also sent by `post`. */
 async function hedged(called, post) {
-  const told = await Promise.race([called, new Promise((done) => setTimeout(done, SOON))]);
-  if (told && !told.lost) return told;
-  const answered = (one) => one.then((told) => (told.lost ? Promise.reject() : told));
+  const answer = await Promise.race([called, new Promise((done) => setTimeout(done, SOON))]);
+  if (answer && !answer.lost) return answer;
+  const answered = (call) => call.then((answer) => (answer.lost ? Promise.reject() : answer));
   const posted = post();
   return Promise.any([answered(called), answered(posted)]).catch(() => posted);
 }
@@ -331,7 +331,7 @@ function disconnected(reason) {
   drive.release(`Released: ${reason || "the connection is lost"}`);
   tried = true;
   camera.connected = false;
-  heard = -Infinity;
+  stateTime = -Infinity;
   views.lost(reason || (state ? "This page connects again." : "")); // the text shown before is outdated
   state = drive.state = wished = null;
   for (const name of ["speed-command", "turn-command"]) views.text(name, "command –");

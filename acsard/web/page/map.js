@@ -108,7 +108,7 @@ export class PathMap {
     const now = [event.clientX, event.clientY];
     if (this.#fingers.size === 2) {
       const other = [...this.#fingers].find(([id]) => id !== event.pointerId)[1];
-      const far = (one) => Math.hypot(one[0] - other[0], one[1] - other[1]);
+      const far = (finger) => Math.hypot(finger[0] - other[0], finger[1] - other[1]);
       if (far(before) > 10) this.zoom(far(now) / far(before));
     } else {
       this.#follow = false;
@@ -159,7 +159,7 @@ export class PathMap {
   }
 
   #grid(paper, width, height, look, at) {
-    const step = [0.1, 0.5, 1, 5, 10, 50, 100].find((one) => one * this.#zoom >= 40) ?? 500;
+    const step = [0.1, 0.5, 1, 5, 10, 50, 100].find((meters) => meters * this.#zoom >= 40) ?? 500;
     paper.strokeStyle = look("--line");
     paper.lineWidth = 1;
     paper.beginPath();

@@ -125,12 +125,12 @@ class Plot {
       const words = `${name} ${last && now - last[0] <= GAP ? signed(last[1], 2) : "–"}`;
       if (said.textContent !== words) said.textContent = words;
       const [small, wide, high] = sized(sample);
-      for (const one of [small, paper]) {
-        one.strokeStyle = look(colour);
-        one.lineWidth = 2;
-        one.setLineDash(LOOKS[n][0]);
-        one.lineDashOffset = LOOKS[n][1];
-        one.beginPath();
+      for (const context of [small, paper]) {
+        context.strokeStyle = look(colour);
+        context.lineWidth = 2;
+        context.setLineDash(LOOKS[n][0]);
+        context.lineDashOffset = LOOKS[n][1];
+        context.beginPath();
       }
       small.moveTo(0, high / 2);
       small.lineTo(wide, high / 2);

@@ -17,17 +17,17 @@ function shown({ key, value, what, when, unit = "", keep = true, low, high, choi
   const name = key.split(/(?<=[._])/).flatMap((part) => [part, made("wbr")]);
   const label = made("label", "", ...name, made("small", "", `${what}${range}; ${when}`));
   label.htmlFor = id;
-  const field = made(choices ? "select" : "input", "", ...(choices ?? []).map((one) => new Option(one, one)));
+  const field = made(choices ? "select" : "input", "", ...(choices ?? []).map((choice) => new Option(choice, choice)));
   field.id = id;
   if (!choices) field.inputMode = typeof value === "number" ? "decimal" : "text";
   field.value = value;
   const send = (more) => call({ settings: { [key]: read(field.value, value) }, ...more });
   field.addEventListener("keydown", (event) => event.key === "Enter" && send({}));
   const button = (words, more) => {
-    const one = made("button", "", words);
-    one.setAttribute("aria-label", `${words} ${key}`);
-    one.addEventListener("click", () => send(more));
-    return one;
+    const element = made("button", "", words);
+    element.setAttribute("aria-label", `${words} ${key}`);
+    element.addEventListener("click", () => send(more));
+    return element;
   };
   const keeper = keep ? button("Keep", { keep: true }) : made("span");
   return made("div", "", label, field, made("span", "quiet", unit.split(" ")[0]), button("Set", {}), keeper);

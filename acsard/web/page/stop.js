@@ -47,9 +47,9 @@ class Stopping {
       console.error(error); // the stop is sent whatever fails beside it
     }
     for (;;) {
-      const told = await this.send();
+      const answer = await this.send();
       if (press !== this.#press) return; // a newer press took over
-      if (this.#ends(told) || press === this.#given) return;
+      if (this.#ends(answer) || press === this.#given) return;
       this.#tell("STOP is not confirmed. This page sends it again; the robot's own switch stops it too.");
       await new Promise((done) => setTimeout(done, PAUSE));
       if (press !== this.#press || press === this.#given) return;
@@ -90,16 +90,16 @@ class Stopping {
     document.documentElement.classList.remove("stops");
   }
 
-  #ends(told) {
-    if (told.barred) {
+  #ends(answer) {
+    if (answer.barred) {
       this.#settle(NOT_HERE);
       this.uninvited();
       return true;
     }
-    if (!told.ok) return false;
+    if (!answer.ok) return false;
     document.documentElement.classList.add("stops"); // this browser was invited again in another tab
     this.#settle(this.#whole ? "" : "STOP: the robot has confirmed it. This page is not complete: reload it.");
-    this.after(told);
+    this.after(answer);
     return true;
   }
 

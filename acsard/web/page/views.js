@@ -23,11 +23,11 @@ export function made(name, look, ...children) {
 
 export function sources(body, state, own) {
   body.replaceChildren(
-    ...state.sources.map((one) => {
-      const drives = one.name === state.source;
-      const who = drives && state.sender ? `${one.name} (${person(state.sender, own)})` : one.name;
-      const cells = [who, String(one.priority), one.age === null ? "–" : ago(one.age)];
-      const waits = drives ? "drives" : one.waits_for;
+    ...state.sources.map((source) => {
+      const drives = source.name === state.source;
+      const who = drives && state.sender ? `${source.name} (${person(state.sender, own)})` : source.name;
+      const cells = [who, String(source.priority), source.age === null ? "–" : ago(source.age)];
+      const waits = drives ? "drives" : source.waits_for;
       return made("tr", drives ? "drives" : "", ...[...cells, waits].map((text) => made("td", "", text)));
     }),
   );
@@ -35,8 +35,8 @@ export function sources(body, state, own) {
 
 export function parts(list, array) {
   list.replaceChildren(
-    ...array.status.map((one) =>
-      made("li", LEVELS[one.level] ?? "error", made("strong", "", one.name.replace(/^acsard: /, "")), ` ${one.message}`),
+    ...array.status.map((part) =>
+      made("li", LEVELS[part.level] ?? "error", made("strong", "", part.name.replace(/^acsard: /, "")), ` ${part.message}`),
     ),
   );
 }
@@ -61,11 +61,11 @@ export function folded(events) {
   return rows;
 }
 
-export function happened(list, told) {
-  const rows = folded([...told.events].reverse()).map((one) => {
-    const by = `${one.by ? ` — ${one.by}` : ""}${one.equal > 1 ? ` ×${one.equal}` : ""}`;
-    const head = made("strong", "", one.name.replaceAll("_", " "));
-    return made("li", one.level, made("span", "quiet", clock(one.stamp, new Date())), " ", head, ` ${one.text}${by}`);
+export function happened(list, { events }) {
+  const rows = folded([...events].reverse()).map((event) => {
+    const by = `${event.by ? ` — ${event.by}` : ""}${event.equal > 1 ? ` ×${event.equal}` : ""}`;
+    const head = made("strong", "", event.name.replaceAll("_", " "));
+    return made("li", event.level, made("span", "quiet", clock(event.stamp, new Date())), " ", head, ` ${event.text}${by}`);
   });
   list.replaceChildren(...rows);
 }
@@ -77,10 +77,10 @@ export function recordings(list, files, barred, trouble) {
   if (list.dataset.shown === all) return; // do not rebuild an unchanged list, so the focus stays
   list.dataset.shown = all;
   text("no-recordings", trouble || (files.length ? "" : "There are no recordings."));
-  const rows = files.map((one) => {
-    const parts = [began(one.begin), lasted(one.seconds), one.being_recorded && "being recorded", barred && `the download is ${barred}`];
-    const link = made(barred ? "span" : "a", "", one.name);
-    if (!barred) Object.assign(link, { href: `api/recordings/${encodeURIComponent(one.name)}`, download: one.name });
+  const rows = files.map((file) => {
+    const parts = [began(file.begin), lasted(file.seconds), file.being_recorded && "being recorded", barred && `the download is ${barred}`];
+    const link = made(barred ? "span" : "a", "", file.name);
+    if (!barred) Object.assign(link, { href: `api/recordings/${encodeURIComponent(file.name)}`, download: file.name });
     return made("li", "", link, made("div", "quiet", parts.filter(Boolean).join(" · ")));
   });
   list.replaceChildren(...rows);
@@ -109,7 +109,7 @@ export function banner(state, locked, own) {
 
 /** Return which bumpers are pressed, in words, or "". */
 function pressed(bumpers) {
-  const numbers = (bumpers ?? []).flatMap((one, n) => (one ? [n + 1] : []));
+  const numbers = (bumpers ?? []).flatMap((isPressed, n) => (isPressed ? [n + 1] : []));
   return numbers.length ? `bumper${numbers.length > 1 ? "s" : ""} ${numbers.join(" and ")} pressed` : "";
 }
 

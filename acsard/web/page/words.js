@@ -78,5 +78,5 @@ export function reason(state, own) {
   if (state.code === "no_command") return "Nobody drives.";
   if (!RELEASE[state.mode]) return state.reason;
   const causes = state.causes.filter(({ kind }) => (kind === "inactive") === (state.mode === "inactive"));
-  return causes.map((one) => `${one.text} · ${clock(one.stamp, new Date())}`).join("; also ") || state.reason;
+  return causes.map(({ text, stamp }) => `${text} · ${clock(stamp, new Date())}`).join("; also ") || state.reason;
 }
