@@ -134,7 +134,6 @@ TWO_COMMANDS = Elsewhere(
 PACKAGING = Elsewhere(PACKAGE, "test_the_same_source_gives_the_same_bytes")
 SERVICE, OPEN = "tests/systemd/test_service.py", "tests/systemd/test_web.py"
 WEB = "tests/system/test_web_strangers.py"
-SIMULATED = "tests/system/test_simulated.py"
 CALIBRATE = "tests/unit/cli/test_calibrate.py"
 PRINTED = Elsewhere(CALIBRATE, "test_the_result_is_printed_as_text_and_the_file_stays")
 CLIENTS = "tests/system/test_languages.py"
@@ -387,9 +386,6 @@ COMMANDS: dict[str, How] = {
     "acsard sim --link ./mcu --fault reversed_motor=b": BROKEN._replace(but="and needs a comma"),
     "acsard mcu check --port ./mcu --yes": BROKEN,
     "acsard echo sim/pose -n 1": Run('"frame_id":"sim"'),
-    "acsard echo wheel_states imu --csv > drive.csv": Elsewhere(
-        SIMULATED, "test_calibrate_reads_a_drive_that_echo_recorded_as_csv"
-    ),
     "acsard calibrate drive": Elsewhere(
         GUIDED, "test_a_person_with_a_gyro_is_guided_from_the_start_to_the_written_file"
     ),

@@ -19,7 +19,6 @@ import numpy.typing as npt
 from msgspec import Struct, field
 from msgspec.structs import replace
 
-from acsard.calibration.log_rows import FOUR
 from acsard.core.formatting import printable
 from acsard.core.values import AcsardError, Metres, Seconds
 from acsard.host.errors import MendableError, RecordingError
@@ -30,7 +29,7 @@ Floats = npt.NDArray[np.float64]
 Complexes = npt.NDArray[np.complex128]
 Mask = npt.NDArray[np.bool_]
 
-TWO = "left", "right"
+FOUR, TWO = ("fr", "fl", "rl", "rr"), ("left", "right")
 APPLIED = "applied_linear", "applied_angular"
 SENSORS = TWO, ("yaw_rate",), ("x", "y"), ("yaw",), APPLIED  # by their columns
 COLUMNS = {

@@ -1,9 +1,8 @@
 """Print each message on a key as one line of JSON, until Ctrl-C. Every key below the robot's id
-works, for example `cmd/teleop`. --csv prints wheel speeds, gyro and position as one table for
-`acsard calibrate log`, for example: acsard echo wheel_states imu --csv > drive.csv. --short
-prints pose, speeds and warnings as text, for example: acsard echo odom -n 1 --short. --rate prints
-each second the message rate, and the times from one message to the next. If --id names several
-robots, each line names its robot, and -n N prints N messages of each robot.
+works, for example `cmd/teleop`. --short prints pose, speeds and warnings as text, for example:
+acsard echo odom -n 1 --short. --rate prints each second the message rate, and the times from one
+message to the next. If --id names several robots, each line names its robot, and -n N prints N
+messages of each robot.
 """
 
 from __future__ import annotations
@@ -22,7 +21,6 @@ import zenoh
 
 from acsard.bus.robot_discovery import ALL_ROBOTS, follow, robot_of, running_robots
 from acsard.bus.subscription import encoded
-from acsard.calibration.log_rows import HEADER, KEYS, row
 from acsard.cli.common import between, whole
 from acsard.cli.connection import (
     SEVERAL_IDS,
@@ -35,13 +33,11 @@ from acsard.cli.connection import (
 )
 from acsard.cli.replies import json_line, of_robot
 from acsard.client.connection import Connection
-from acsard.client.reads import decoder
 from acsard.core import formatting
 from acsard.core.messages.encodings import DecodeError, Decoder
 from acsard.core.messages.keys_and_roles import TOPICS, by_key
 from acsard.core.messages.schema import MESSAGES
 from acsard.core.messages.short_texts import SHORT_TEXTS, short
-from acsard.host import clock
 from acsard.host.errors import Exit, NoAnswerError, UsageError
 
 RATE_SPAN_S = 10.0  # of the messages that a line of `--rate` describes
@@ -49,19 +45,13 @@ RATE_SPAN_S = 10.0  # of the messages that a line of `--rate` describes
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
-        "topic", nargs="+", help="Zenoh key, for example odom, state, wheel_states, cmd/teleop"
+        "topic", help="Zenoh key, for example odom, state, wheel_states, cmd/teleop"
     )
     form = parser.add_mutually_exclusive_group()
     form.add_argument(
         "--short",
         action="store_true",
         help="print one line of text per message (only for odom, state, cmd_vel_out and sim/pose)",
-    )
-    form.add_argument(
-        "--csv",
-        action="store_true",
-        help="print a CSV log for `acsard calibrate log` (for one or more of the keys "
-        "wheel_states, imu and sim/pose)",
     )
     form.add_argument(
         "--rate",
@@ -85,19 +75,9 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def main(args: argparse.Namespace) -> int:
-    topic = args.topic[0]
-    if (args.csv or args.rate) and several_ids(args):
-        raise UsageError("with --csv or --rate, name one robot in --id")
-    if args.csv:
-        for key in args.topic:
-            if key not in KEYS:
-                raise UsageError(f"{key} cannot be in a CSV log; --csv takes {', '.join(KEYS)}")
-        with connected(args) as robot, silence_explained(robot, topic, args.timeout) as on_message:
-            return _record(robot, args.topic, args.n, args.timeout, on_message)
-    if len(args.topic) > 1:
-        raise UsageError(
-            "several keys can only be printed as one CSV log: add --csv, or name one key"
-        )
+    topic = args.topic
+    if args.rate and several_ids(args):
+        raise UsageError("with --rate, name one robot in --id")
     short_form = _shortened(topic) if args.short else None
     require_followed(topic)
     if args.rate:
@@ -225,48 +205,6 @@ def _message_text(decoder: Decoder[Any] | None, encoding: str, payload: bytes, w
             return formatting.printable(f"{whose}: {text}" if whose else text)
     line = json_line(encoding, payload)
     return of_robot(whose, line) if whose else formatting.json_line(line)
-
-
-def _record(
-    robot: Connection,
-    keys: list[str],
-    most: int | None,
-    timeout: float | None,
-    on_message: Callable[[], None],
-) -> int:
-    queues = [(key, robot.subscribe(key), decoder(key)) for key in keys]
-    reported = set[str]()
-    print(HEADER, flush=True)
-    count, heard_s = 0, time.monotonic()
-    try:
-        while most is None or count < most:
-            if timeout is not None and time.monotonic() - heard_s > timeout:
-                return Exit.FAILURE
-            for key, queue, reader in queues:
-                while (sample := queue.try_recv()) is not None and count != most:
-                    on_message()
-                    try:
-                        line = row(reader.decode(*encoded(sample)), clock.now().wall_ns)
-                    except (DecodeError, ValueError) as error:
-                        if key not in reported:
-                            reported.add(key)
-                            _report_left_out(robot.key(key), key, error)
-                        continue
-                    print(line)
-                    count, heard_s = count + 1, time.monotonic()
-            time.sleep(0.02)
-    except KeyboardInterrupt:
-        pass
-    return Exit.OK
-
-
-def _report_left_out(full_key: str, key: str, error: Exception) -> None:
-    print(
-        f"acsard: a message on {full_key} is left out of the log: "
-        f"{formatting.printable(str(error))}. Further such messages on this key are left out "
-        f"without a report. Correct the program that sends them; `acsard echo {key}` prints them",
-        file=sys.stderr,
-    )
 
 
 def _expected(robot: Connection, ids: tuple[str, ...]) -> Collection[str]:

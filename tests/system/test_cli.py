@@ -237,9 +237,6 @@ def test_echo_of_a_silent_key_ends_with_1_after_its_timeout(shared: Daemon) -> N
     ended = tool(shared, "echo", "battery", "--timeout", "0.1")
     assert (ended.code, ended.out) == (1, "")
     assert "battery has a value only while the board reports the battery's " in ended.err
-    ended = tool(shared, "echo", "imu", "--csv", "--timeout", "0.1")
-    assert ended.code == 1
-    assert "but no program sends on the Zenoh key imu now" in ended.err
 
 
 @pytest.mark.slow
@@ -252,10 +249,6 @@ def test_echo_of_a_silent_key_ends_with_1_after_its_timeout(shared: Daemon) -> N
         ),
         (
             ["echo", "odom", "--rate", "--id", "acsra"],
-            "there is no robot acsra. Robots here: acsar",
-        ),
-        (
-            ["echo", "imu", "--csv", "--id", "acsra"],
             "there is no robot acsra. Robots here: acsar",
         ),
         (["echo", "cmd/nobody"], "but no program sends on the Zenoh key cmd/nobody now"),

@@ -10,12 +10,11 @@ from typing import Any
 
 import pytest
 
-from acsard.calibration.log import read
 from acsard.core.messages.encodings import encode
 from acsard.core.messages.schema import Header, Imu, Quaternion, Vector3
 from acsard.core.ros.attachments import Attachment
 from acsard.core.ros.names import rmw_key
-from tests.system.harness import Bus, Daemon, Peer, acsard, finish, running, seconds, until
+from tests.system.harness import Bus, Daemon, Peer, running, seconds, until
 
 SKIDDING: dict[str, dict[str, object]] = {"sim": {"track_multiplier": 1.6}}
 
@@ -94,21 +93,6 @@ def test_the_simulated_gyro_corrects_the_odometry_and_is_published_as_imu(tmp_pa
         turned = yaw(bus.get("sim/pose")["pose"]) - true
         assert yaw(bus.get("odom")["pose"]["pose"]) - believed == pytest.approx(turned, rel=0.03)
         assert samples.seen[0].encoding == "application/msgpack;acsard.Imu.v1"
-
-
-@pytest.mark.slow
-def test_calibrate_reads_a_drive_that_echo_recorded_as_csv(tmp_path: Path) -> None:
-    tables: dict[str, dict[str, object]] = {"odometry": {"gyro": True}}
-    with running(tmp_path, config=tables) as (daemon, _):
-        words = ("echo", "wheel_states", "imu", "--csv", "-n", "600")
-        ended = finish(acsard(*words, "--config", str(daemon.config)), tmp_path)
-        assert ended.code == 0, ended
-        (run,) = read(ended.out.encode()).runs
-        assert min(len(run.t), len(run.turned)) > 100
-        # A robot that stood all the time gives no result; the calibration says so in its own words.
-        (tmp_path / "drive.csv").write_text(ended.out)
-        result = finish(acsard("calibrate", "log", "drive.csv"), tmp_path)
-        assert (result.code, "drive.csv: " in result.err) == (1, True)
 
 
 @pytest.mark.slow

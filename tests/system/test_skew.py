@@ -118,7 +118,6 @@ READING_TOOLS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
     "echo --short": (("echo", "odom", "-n", "1", "--short"), ("forward",)),
     "echo state": (("echo", "state", "-n", "1", "--short"), ("yaw",)),
     "echo --rate": (("echo", "odom", "-n", "2", "--rate"), ("Hz",)),
-    "echo --csv": (("echo", "wheel_states", "sim/pose", "-n", "4", "--csv"), ("t,",)),
     "echo of all": (("echo", "state", "-n", "1", "--id", "*"), ("counters",)),
     "top": (("top", "--once"), ("up",)),
     "fleet": (("fleet", "--once"), ("acsar",)),

@@ -10,16 +10,12 @@ from typing import Any
 import msgspec
 import pytest
 
-from acsard.calibration.log_rows import HEADER
 from acsard.cli import echo, main
-from acsard.cli.echo import Quota, _message_text, _print, _record, rate_text
+from acsard.cli.echo import Quota, _message_text, _print, rate_text
 from acsard.cli.replies import json_line
 from acsard.core.messages.encodings import Decoder, Format, encode, encoding_name
 from acsard.core.messages.schema import (
     Header,
-    Imu,
-    JointState,
-    Quaternion,
     Twist,
     TwistStamped,
     Vector3,
@@ -168,46 +164,6 @@ def test_a_message_without_a_short_form_is_shown_as_its_json() -> None:
     assert msgspec.json.decode(_message_text(decoder, "", b"\xff", "")) == {
         "undecodable": repr(b"\xff")
     }
-
-
-def test_a_message_that_does_not_fit_into_the_csv_log_is_left_out_and_reported_once_per_key(
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    unknown = [0.0] * 9
-    turn = Imu(Header(), Quaternion(), unknown, Vector3(z=0.5), unknown, Vector3(), unknown)
-    wheels = [JointState(Header(), [], [], [1.0] * count, []) for count in (1, 4)]
-    payloads = {
-        "imu": [
-            b'{"a\\u001b":1}',
-            encode(turn, "json"),
-            b"\xff",
-            b'{"angular_velocity":{"z":0.5}}',
-        ],
-        "wheel_states": [encode(wheel, "json") for wheel in wheels],
-    }
-    calls: list[None] = []
-
-    def subscribe(name: str) -> Any:
-        samples = [
-            SimpleNamespace(
-                encoding="", payload=SimpleNamespace(to_bytes=lambda payload=payload: payload)
-            )
-            for payload in payloads[name]
-        ]
-        return SimpleNamespace(try_recv=lambda: samples.pop(0) if samples else None)
-
-    robot: Any = SimpleNamespace(key=lambda name: f"acsard/acsar/{name}", subscribe=subscribe)
-    assert _record(robot, list(payloads), 3, None, lambda: calls.append(None)) == 0
-    out, err = capsys.readouterr()
-    table = [line.split(",")[1:] for line in out.splitlines()]
-    gyro = ["", "", "", "", "0.5", "", "", ""]
-    assert table == [HEADER.split(",")[1:], gyro, gyro, ["1"] * 4 + [""] * 4]
-    assert len(calls) == 6
-    imu, joints = err.splitlines()
-    assert "a message on acsard/acsar/imu is left out of the log" in imu
-    assert "\x1b" not in imu
-    assert "`acsard echo imu` prints" in imu
-    assert "a message on acsard/acsar/wheel_states is left out" in joints
 
 
 @each("times", [[], [3.0], [1.0, 1.0]])

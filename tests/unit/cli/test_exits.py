@@ -77,7 +77,6 @@ def test_a_verb_may_end_with_any_code(code: Exit) -> None:
             "set rates.telemetry 5 --id r1 log.level info",
             "set rates.telemetry 5 log.level info --id r1",
         ),
-        ("echo imu -n 1 wheel_states --csv", "echo imu wheel_states --csv -n 1"),
     ],
 )
 def test_an_option_may_stand_between_two_arguments(between: str, behind: str) -> None:
