@@ -19,6 +19,7 @@ class Address(NamedTuple):
     endpoint: str
     robot_id: str
     tls: str  # directory of the client's certificate; "" without TLS
+    advice: str = ""  # if no daemon is there
 
 
 def address_of(
@@ -39,7 +40,13 @@ def address_of(
     endpoints = sorted(bus.listening or bus.connect, key=is_tls)
     endpoint = connect or reachable(endpoints[0])
     certificates = (tls or bus.tls) if is_tls(endpoint) else ""
-    return Address(endpoint, robot_id, certificates)
+    advice = ""
+    if not connect and bus.mode == "peer" and bus.connect:
+        advice = (
+            'if this computer has no daemon, write bus.mode = "client" into its configuration '
+            "file: then the tools connect to bus.connect"
+        )
+    return Address(endpoint, robot_id, certificates, advice)
 
 
 def address_by_environment(endpoint: str | None, robot_id: str | None, tls: str | None) -> Address:
@@ -59,6 +66,7 @@ def address_by_environment(endpoint: str | None, robot_id: str | None, tls: str 
         where.endpoint if endpoint is None else endpoint,
         where.robot_id,
         where.tls if tls is None else tls,
+        where.advice,
     )
 
 

@@ -91,9 +91,9 @@ def no_robot_text(endpoint: str) -> str:
     """Return a message that explains why no robot is visible at an endpoint."""
     if is_tls(endpoint):
         return (
-            "no robot is visible. Over TLS, name the robots (--id robot1,robot2), or set [access] "
-            "wildcards = true on the robots. If that does not help, your certificate may have no "
-            "role at any robot; `acsard doctor --id robot1` checks this"
+            "no robot is visible. Over TLS, name the robots: --id robot1,robot2, or once in "
+            "[fleet] robots. If that does not help, your certificate may have no role at any "
+            "robot; `acsard doctor --id robot1` checks this"
         )
     return (
         f"no robot is visible at {endpoint}; is a daemon running there, or is a daemon connected "

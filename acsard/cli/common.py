@@ -29,6 +29,12 @@ def add_config(parser: argparse.ArgumentParser, default: object = None) -> None:
     )
 
 
+def add_port(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--port", metavar="DEVICE", help='serial device of the MCU, or "sim" (default: mcu.port)'
+    )
+
+
 def add_outcome(parser: argparse.ArgumentParser, result: str) -> None:
     """Add --json and --write, which stores `result` in the words of the help."""
     parser.add_argument("--json", action="store_true", help="print one JSON object")

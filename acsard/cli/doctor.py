@@ -14,7 +14,7 @@ import msgspec
 from rich.text import Text
 
 from acsard.bus.address import address_of
-from acsard.cli.common import overrides
+from acsard.cli.common import add_port, overrides
 from acsard.cli.connection import add_bus, require_one
 from acsard.core.formatting import json_line, lines, printable
 from acsard.host.config_file import find
@@ -26,13 +26,14 @@ LEVEL_MARKS = {"ok": ("ok  ", "green"), "warning": ("warn", "yellow"), "failure"
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     add_bus(parser)
+    add_port(parser)
     parser.add_argument("--json", action="store_true", help="print JSON")
 
 
 def main(args: argparse.Namespace) -> int:
     require_one(args)
     find_address = partial(address_of, connect=args.connect, robot_id=args.id, tls=args.tls)
-    findings = list(examine(*find(args.config), overrides({}), find_address))
+    findings = list(examine(*find(args.config), overrides({"mcu.port": args.port}), find_address))
     if args.json:
         print(json_line(msgspec.json.encode(findings).decode()))
     else:

@@ -14,7 +14,7 @@ from acsard.checkup import procedure
 from acsard.checkup.board import Wire
 from acsard.checkup.checkup_report import changes, report, summary, withheld
 from acsard.checkup.findings import Finding
-from acsard.cli.common import add_config, add_outcome, load
+from acsard.cli.common import add_config, add_outcome, add_port, load
 from acsard.core.config.settings import SIMULATOR, Config
 from acsard.core.simulator.fake_mcu import FakeMcu
 from acsard.core.simulator.virtual_wire import VirtualWire
@@ -52,7 +52,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         description=DESCRIPTION,
     )
     add_config(check)
-    check.add_argument("--port", metavar="DEVICE", help='serial device of the MCU, or "sim"')
+    add_port(check)
     check.add_argument(
         "--baud-rate", type=int, metavar="N", help="baud rate to try first, from 9600 to 115200"
     )

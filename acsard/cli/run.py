@@ -13,7 +13,7 @@ from importlib.util import find_spec
 from pathlib import Path
 
 from acsard.bus.zenoh_sessions import reachable
-from acsard.cli.common import add_config, load, options_text, with_record_directory
+from acsard.cli.common import add_config, add_port, load, options_text, with_record_directory
 from acsard.core.config.contradictions import warnings
 from acsard.core.config.settings import Config
 from acsard.core.values import ROOT_KEY, Event
@@ -38,7 +38,7 @@ _PAGE = "  page    {where}, for a browser; a line below says when the page is re
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     add_config(parser)
-    parser.add_argument("--port", metavar="DEVICE", help='serial device of the MCU, or "sim"')
+    add_port(parser)
     parser.add_argument("--baud-rate", type=int, metavar="N", help="from 9600 to 115200")
     parser.add_argument("--id", metavar="ID", help="the robot's id on the bus")
     parser.add_argument(

@@ -64,6 +64,7 @@ from acsard.host.errors import (
     NotDrivenError,
     NotPermittedError,
     ReplyError,
+    UnreachableError,
     UsageError,
 )
 from acsard.host.own_identity import new_secret, own_name, sender_id
@@ -79,7 +80,10 @@ TIMED_OUT = "Timeout"
 @contextmanager
 def open_connection(where: Address, source: str = "app") -> Iterator[Connection]:
     """Yield a connection that is ended at the end of the `with` block."""
-    session = client_session(where.endpoint, where.tls)
+    try:
+        session = client_session(where.endpoint, where.tls)
+    except UnreachableError as error:
+        raise UnreachableError("; ".join(filter(None, (str(error), where.advice)))) from None
     connection = Connection(session, where.robot_id, source, where.tls, where.endpoint)
     end_at_exit(connection)
     try:

@@ -147,6 +147,7 @@ def query_or_finding(config: Config, address: Address) -> Running | Finding:
             "run; otherwise start it with `acsard run`. If the daemon was started with --listen "
             "ADDRESS, give this command the same address with --connect"
         )
+        mend = "; ".join(filter(None, (mend, address.advice)))
         return Finding("daemon", "warning", f"no program listens at {endpoint}", mend)
     try:
         return query(config, address)

@@ -12,11 +12,12 @@ from acsard.cli import parser
 from acsard.cli.common import OPTIONS, load, with_record_directory
 from acsard.cli.connection import require_asked, require_followed, robot_address
 from acsard.cli.run import options
+from acsard.client.connection import open_connection
 from acsard.core.config.parsing import parse
 from acsard.core.config.settings import Config
 from acsard.host import config_file
 from acsard.host.config_file import SEARCH_PATHS, find, writable
-from acsard.host.errors import Exit, MendableError, UsageError
+from acsard.host.errors import Exit, MendableError, UnreachableError, UsageError
 
 
 class Places:
@@ -121,9 +122,10 @@ def address_of(
     robot_id: str | None = None,
     tls: str | None = None,
 ) -> tuple[str, str, str]:
-    return robot_address(
+    where = robot_address(
         argparse.Namespace(config=str(config), connect=connect, id=robot_id, tls=tls)
     )
+    return where.endpoint, where.robot_id, where.tls
 
 
 def test_a_tool_talks_to_the_robot_of_the_configuration(places: Places) -> None:
@@ -144,6 +146,21 @@ def test_a_tool_connects_to_the_router_of_a_daemon_in_client_mode(places: Places
         '[bus]\nmode = "client"\nlisten = ["tcp/127.0.0.1:8"]\nconnect = ["tcp/127.0.0.1:7447"]\n'
     )
     assert address_of(places.option)[0] == "tcp/127.0.0.1:7447"
+
+
+def test_a_file_with_a_router_whose_mode_is_peer_may_be_of_a_computer_without_a_daemon(
+    places: Places,
+) -> None:
+    places.option.write_text('[bus]\nconnect = ["tls/router:7447"]\ntls = "/home/a"\n')
+    args = argparse.Namespace(config=str(places.option), connect="tcp/127.0.0.1:1", id=None, tls="")
+    assert not robot_address(args).advice
+    args.connect = None
+    where = robot_address(args)._replace(endpoint="tcp/127.0.0.1:1")
+    with (
+        pytest.raises(UnreachableError, match="no daemon, write bus.mode"),
+        open_connection(where),
+    ):
+        pass
 
 
 def test_a_certificate_goes_with_a_tls_endpoint_only(
