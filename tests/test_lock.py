@@ -8,14 +8,14 @@ from pathlib import Path
 from packaging.requirements import Requirement
 
 from tests.each import each
-from tests.lock import (
+from tests.tools.lock import (
     LOCK,
     RELEASE_LOCK,
     build_requirements,
     release_requirements,
     run_requirements,
 )
-from tests.lowest import lowest
+from tests.tools.lowest import lowest
 
 PIN = re.compile(r"^([a-z0-9-]+)==(\S+) \\\n((?: {4}--hash=sha256:[0-9a-f]{64}(?: \\)?\n)+)", re.M)
 

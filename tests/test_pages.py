@@ -1,6 +1,6 @@
-"""Static checks find no wrong command, file, link or TOML on the pages.
+"""Static checks find no wrong command, file, link, extra or TOML on the pages.
 
-`tests/system/test_pages.py`, or the checks that `tests/pages.py` names, run the commands.
+`tests/system/test_pages.py` runs the commands, unless the page says why not.
 """
 
 from __future__ import annotations
@@ -13,9 +13,8 @@ import subprocess
 import tomllib
 from collections.abc import Iterator
 from functools import cache
-from itertools import pairwise
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any
 
 import msgspec
 import pytest
@@ -23,86 +22,22 @@ import zenoh
 
 from acsard import cli
 from acsard.core.config.settings import Config
-from acsard.host.extras import Extra
 from tests.each import each
-from tests.pages import (
-    COMMANDS,
-    LANGUAGES,
-    PAGES,
-    ROOT,
-    Block,
-    Elsewhere,
-    InCi,
-    blocks,
-    promises,
-    prose,
-    text_of,
-)
+from tests.pages import PAGES, ROOT, Block, blocks, prose, text_of
 
-ON_PAGES = [(block, command) for block in blocks() for command in block.commands()]
+COMMANDS = list(dict.fromkeys(line for block in blocks() for line in block.commands()))
 
 PLACEHOLDERS = {"NAME": "mute", "ROLE": "viewer", "VERB": "run", "HZ": "50"}
 
 
-def at(block: Block) -> str:
-    return block.where
-
-
-def test_each_part_has_a_page_in_its_own_directory() -> None:
-    parts = ("calibration", "clients", "firmware", "foxglove", "release", "ros2", "systemd", "web")
-    beside = {f"deploy/{part}/README.md" for part in (*parts, "zenoh")}
-    assert set(PAGES) == {
-        "README.md",
-        "acsard/README.md",
-        "tests/README.md",
-        "deploy/README.md",
-        *beside,
-    }
-
-
 # commands
-
-
-def test_every_command_on_every_page_is_run_by_a_test() -> None:
-    unknown = [f"{block.where}: {text}" for block, text in ON_PAGES if text not in COMMANDS]
-    assert not unknown, "say in tests/pages.py what runs these:\n" + "\n".join(unknown)
-
-
-def test_every_command_of_the_list_is_on_a_page() -> None:
-    assert set(COMMANDS) == {command for _, command in ON_PAGES}
-
-
-def named_tests(file: str) -> set[str]:
-    tree = ast.parse((ROOT / file).read_text(encoding="utf-8"))
-    kinds = (ast.FunctionDef, ast.AsyncFunctionDef)
-    functions = {node.name for node in tree.body if isinstance(node, kinds)}
-    return {name for name in functions if name.startswith("test_")}
-
-
-@each("how", sorted({how for how in COMMANDS.values() if isinstance(how, Elsewhere)}))
-def test_the_test_named_for_a_command_exists(how: Elsewhere) -> None:
-    assert how.test in named_tests(how.file)
-
-
-def test_ci_runs_the_commands_that_the_list_assigns_to_it() -> None:
-    script = (ROOT / ".ci/run").read_text(encoding="utf-8")
-    words = {how.words for how in COMMANDS.values() if isinstance(how, InCi)}
-    assert words
-    assert not {line for line in words if line not in script}
-
-
-@each("block", blocks())
-def test_a_block_is_of_a_kind_that_is_checked(block: Block) -> None:
-    assert block.language in LANGUAGES
-    if block.language != "console":
-        assert not re.search(r"^\$ ", block.text, re.M), "a command in no console"
 
 
 def test_every_block_of_commands_is_shell() -> None:
     shell = shutil.which("bash")
     if shell is None:
         pytest.skip("no bash")
-    text = "\n".join(command for _, command in ON_PAGES)
+    text = "\n".join(COMMANDS)
     done = subprocess.run([shell, "-n", "-c", text], capture_output=True, text=True, check=False)
     assert (done.returncode, done.stderr) == (0, "")
 
@@ -152,41 +87,26 @@ def test_a_verb_in_the_text_has_the_options_named_with_it(
 
 # extras
 
-EXTRA = re.compile(r"pip install (?:-e )?\s*'(\S*)\[([\w,]+)\]'")
 
-
-def test_an_extra_is_installed_from_a_clone_since_no_index_has_acsard() -> None:
-    texts = [text_of(page) for page in PAGES]
-    matches = [match for text in texts for match in EXTRA.findall(text)]
-    pairs = {(place, extra) for place, extras in matches for extra in extras.split(",")}
+def test_an_extra_is_installed_from_a_clone_and_each_one_is_named_on_a_page() -> None:
+    """No index has acsard."""
+    text = "".join(map(text_of, PAGES))
+    named = re.findall(r"pip install (?:-e )?\s*'(\S*)\[([\w,]+)\]'", text)
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
-    known = {(".", extra) for extra in project["optional-dependencies"]}
-    assert pairs
-    assert pairs <= known
-    assert {(".", extra) for extra in get_args(Extra)} <= known
-
-
-# calls of pytest
-
-
-@each("arguments", promises())
-def test_the_tests_that_prove_a_promise_exist(arguments: list[str]) -> None:
-    files: list[Path] = []
-    for word in (word for word in arguments if word.startswith("tests/")):
-        paths = list(ROOT.glob(word))
-        assert paths, word
-        for path in paths:
-            files += [path] if path.is_file() else path.rglob("test_*.py")
-    text = "".join(file.read_text(encoding="utf-8") for file in files)
-    options = dict(pairwise(arguments))
-    for word in re.findall(r"\w+", options.get("-k", "")):
-        assert word in ("or", "and", "not") or re.search(rf"def test_\w*{word}", text), word
-    marks = (ROOT / "pyproject.toml").read_text(encoding="utf-8")
-    for word in re.findall(r"\w+", options.get("-m", "")):
-        assert word in ("or", "and", "not") or f'"{word}: ' in marks, word
+    assert {place for place, _ in named} == {"."}
+    assert {extra for _, extras in named for extra in extras.split(",")} <= set(
+        project["optional-dependencies"]
+    )
+    for extra in project["optional-dependencies"]:
+        assert re.search(rf"`{extra}`|\[(\w+,)*{extra}(,\w+)*\]", text), extra
 
 
 # other blocks
+
+
+@each("block", blocks("sh"))
+def test_a_shell_block_shows_no_prompt(block: Block) -> None:
+    assert not re.search(r"^\$ ", block.text, re.M)
 
 
 @each("block", blocks("toml"))
@@ -198,20 +118,9 @@ def test_lines_for_the_configuration_are_accepted(block: Block) -> None:
         msgspec.convert(values, kind)
 
 
-@pytest.mark.parametrize("block", blocks("json5"), ids=at)
+@each("block", blocks("json5"))
 def test_settings_for_zenoh_are_accepted(block: Block) -> None:
     zenoh.Config.from_json5(block.text)
-
-
-def test_every_python_block_is_on_a_page_whose_examples_are_run() -> None:
-    """`test_client.py` and `test_web.py` in `tests/system/` run these blocks."""
-    assert {block.page for block in blocks("python")} == {"README.md", "deploy/web/README.md"}
-
-
-@each("language", ["html", "js"])
-def test_every_javascript_block_is_on_a_page_whose_examples_are_run(language: str) -> None:
-    """`tests/system/test_web_dashboard.py` runs these blocks."""
-    assert {block.page for block in blocks(language)} == {"deploy/web/README.md"}
 
 
 def test_the_subscribers_of_other_languages_in_the_readme_are_those_that_are_run() -> None:
@@ -337,14 +246,16 @@ def test_every_file_of_the_tour_is_there() -> None:
     assert not {name for name in named if not exists(name, below=ROOT / "acsard")}
 
 
-@pytest.mark.parametrize("page", ["tests/README.md", "deploy/systemd/README.md"])
-def test_every_file_that_a_page_s_table_names_is_there(page: str) -> None:
+def test_the_page_of_the_service_names_every_file_beside_it() -> None:
+    page = "deploy/systemd/README.md"
     here = (ROOT / page).parent
     for cell in re.findall(r"^\| `([^`\s]+)`[^|]* \|", prose(page), re.M):
         assert sorted(here.glob(cell)), cell
-    if page.startswith("deploy"):
-        missing = {p.name for p in here.iterdir() if p.name != "README.md"}
-        assert not {name for name in missing if f"`{name}`" not in text_of(page)}
-    else:
-        rooms = {p.name for p in here.iterdir() if p.is_dir() and (p / "__init__.py").exists()}
-        assert not {name for name in rooms if f"`{name}/`" not in text_of(page)}
+    assert not {p.name for p in here.iterdir() if f"`{p.name}`" not in text_of(page)} - {
+        "README.md"
+    }
+
+
+def test_the_page_of_the_tests_names_every_directory_of_tests() -> None:
+    rooms = {p.name for p in (ROOT / "tests").iterdir() if (p / "__init__.py").exists()}
+    assert not {name for name in rooms if f"`{name}/`" not in text_of("tests/README.md")}

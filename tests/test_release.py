@@ -20,8 +20,8 @@ from packaging.requirements import Requirement
 from acsard import __version__
 from acsard.host.version import commit_of, full_version
 from deploy.release import contents
-from tests.lock import run_requirements
 from tests.pages import ROOT
+from tests.tools.lock import run_requirements
 
 HOME = "https://github.com/acsard/acsard"
 

@@ -1,7 +1,7 @@
 """Play random plans against the whole daemon in virtual time.
 
 The program prints a line for each plan in which the daemon breaks a promise of its documentation.
-`tests/README.md` says how to use it.
+`tests/simulate/README.md` says how to use it.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """The intended differences between two checkouts, which a paired run does not report.
 
 A change that intentionally alters the daemon's behavior is listed here as long as an older checkout
-is compared with newer ones. The section on older checkouts in `tests/README.md` explains how.
+is compared with newer ones, as `tests/simulate/README.md` explains.
 """
 
 from __future__ import annotations

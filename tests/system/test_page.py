@@ -19,8 +19,6 @@ import pytest
 
 from acsard.machine.authority import Authority
 from acsard.web.viewer import PING_INTERVAL_S
-from tests import pictures
-from tests.pictures import VIEWS
 from tests.system.browser import NAME, TRUSTING, Page, answer, hands
 from tests.system.bystander import lost
 from tests.system.chromium import (
@@ -33,6 +31,8 @@ from tests.system.chromium import (
     browsing,
 )
 from tests.system.harness import Bus, Daemon, Peer, Program, until
+from tests.tools import pictures
+from tests.tools.pictures import VIEWS
 
 pytestmark = [
     pytest.mark.slow,

@@ -14,9 +14,9 @@ from pathlib import Path
 
 import pytest
 
-from tests import pictures
 from tests.system.chromium import CHROMIUM, Browser
 from tests.system.harness import until
+from tests.tools import pictures
 
 pytestmark = [
     pytest.mark.slow,

@@ -29,7 +29,6 @@ from acsard.core.values import NS_PER_S
 from acsard.host.child import SILENCE_TIMEOUT_NS
 from acsard.recording.file import MAGIC
 from acsard.web.openapi import KEYS
-from tests import described
 from tests.system.browser import Page, answer, hands, text
 from tests.system.harness import (
     PATIENCE_S,
@@ -47,6 +46,7 @@ from tests.system.harness import (
     until,
     write_config,
 )
+from tests.unit.web import described
 
 
 @pytest.fixture

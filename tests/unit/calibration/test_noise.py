@@ -1,7 +1,7 @@
 """The geometry and the noise from the calibration of a log also describe other drives.
 
-`-m "soak or not soak" -s` prints the table of `tests/README.md`. A row describes the robots of one
-kind by these figures:
+`-m "soak or not soak" -s` prints the table of `deploy/calibration`. A row describes the robots of
+one kind by these figures:
 
 - the NEES with three degrees of freedom after drives of a minute, with the fitted noise and with
   the default noise,
@@ -51,7 +51,7 @@ PIECE = 1000
 """Number of feedback lines after which heading and distance are judged: 10 s."""
 
 ROBOTS = 6
-"""Number of robots in a row of `tests/README.md`."""
+"""Number of robots in a row of `deploy/calibration`."""
 
 GYRO_SCALE = 0.005
 

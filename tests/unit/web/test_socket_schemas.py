@@ -18,9 +18,9 @@ from acsard.web.openapi import KEYS, SENT_MESSAGES, VALUE_PREFIX
 from acsard.web.socket_sender import Following
 from acsard.web.streams import VIEWER_KEYS as FOLLOWED
 from acsard.web.streams import Stream
-from tests.described import FRAMES, SCHEMAS, is_described_frame, kinds, spoilt
 from tests.each import each
 from tests.unit.core.messages.examples import OUTPUTS, SNAPSHOT, START, due
+from tests.unit.web.described import FRAMES, SCHEMAS, is_described_frame, kinds, spoilt
 
 GREETING = socket_messages.Greeting(
     "acsar", "1", "operator", "phone/1f", socket_messages.Limits(1.0, 4.0), True, 10.0,

@@ -1,8 +1,8 @@
 """Take pictures of the robot's page and of a recording's report, for people to look at.
 
-`python -m tests.pictures DIRECTORY` writes every view of the page as PNG: on a phone upright and
-sideways and on a desktop, in light and dark colours, and the view *Drive* in each state. It also
-writes the whole report of a drive, 1280 and 390 pixels wide. `--report` writes the report alone.
+`python -m tests.tools.pictures DIRECTORY` writes every view of the page as PNG: on a phone upright
+and sideways and on a desktop, in light and dark colours, and the view *Drive* in each state. It
+also writes the whole report of a drive, 1280 and 390 pixels wide. `--report` writes only that.
 """
 
 from __future__ import annotations

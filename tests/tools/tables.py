@@ -1,6 +1,6 @@
 """Writes parts of the pages, of the router's and of the bridge's file from the table of keys.
 
-`python -m tests.tables` writes them, and `tests/test_tables.py` compares them.
+`python -m tests.tools.tables` writes them, and `tests/test_tables.py` compares them.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from acsard.core.ros.transports import ros_names
 from acsard.core.values import ROLES, Role, Verb
 from acsard.machine.router_file import EXAMPLE_ROBOT
 
-ROOT = Path(__file__).parent.parent
+ROOT = Path(__file__).parents[2]
 
 
 # the tables of the pages

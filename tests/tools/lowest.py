@@ -1,4 +1,4 @@
-"""`python -m tests.lowest`: print pip constraints for the lowest allowed versions.
+"""`python -m tests.tools.lowest`: print pip constraints for the lowest allowed versions.
 
 It writes one `name==version` per line: for each dependency the lowest version that
 `pyproject.toml` allows. The output is for `pip install --constraint`.
@@ -11,7 +11,7 @@ import tomllib
 from itertools import chain
 from pathlib import Path
 
-PYPROJECT = Path(__file__).resolve().parents[1] / "pyproject.toml"
+PYPROJECT = Path(__file__).resolve().parents[2] / "pyproject.toml"
 
 BOUND = re.compile(r"^([A-Za-z0-9-]+)>=([0-9.]+)")
 

@@ -1,4 +1,4 @@
-"""`python -m tests.lock`: rewrite the two lock files with today's versions.
+"""`python -m tests.tools.lock`: rewrite the two lock files with today's versions.
 
 `deploy/systemd/requirements.lock` has what an install of acsard with the extra `tools` takes from
 the package index, including what builds it. `deploy/release/requirements.lock` has the programs
@@ -22,7 +22,7 @@ from itertools import product
 from pathlib import Path
 from typing import Any
 
-ROOT = Path(__file__).resolve().parents[1]
+ROOT = Path(__file__).resolve().parents[2]
 
 LOCK = ROOT / "deploy" / "systemd" / "requirements.lock"
 
@@ -43,7 +43,7 @@ HEAD = """\
 #
 #     pip install -r requirements.lock
 #
-# Written by `python -m tests.lock`. .ci/run tests on it. The nightly job runs the unit tests
+# Written by `python -m tests.tools.lock`. .ci/run tests on it. The nightly job runs the unit tests
 # on the lowest versions that pyproject.toml allows, and on the newest.
 """
 
@@ -52,7 +52,7 @@ BUILD = "\n# To build acsard:\n"
 
 RELEASE_HEAD = """\
 # The programs that make and check a release, for Python 3.11 to 3.14 on x86_64, and what builds
-# acsard. Written by `python -m tests.lock`.
+# acsard. Written by `python -m tests.tools.lock`.
 """
 
 Pins = dict[str, tuple[str, set[str]]]
