@@ -211,11 +211,6 @@ class Rig:
 
     # Measuring
 
-    @property
-    def first_odometry_ns(self) -> int:
-        """When the first odometry arrived here, which includes the time of our own connection."""
-        return self._arrived[0][0]
-
     def _odometry(self, sample: zenoh.Sample) -> None:
         self._arrived.append((clock.mono_ns(), sample.payload.to_bytes()))
 
@@ -281,10 +276,6 @@ class Rig:
         at_ns = clock.mono_ns()
         self._publisher.put(payload, attachment=self._attachment)
         return SentCommand(at_ns, line)
-
-    def unsubscribe(self) -> None:
-        """Unsubscribe from the odometry, so that no more samples are recorded."""
-        self._subscriber.undeclare()
 
     def state(self) -> RobotState:
         key = full_key(self._config.robot.id, "state")

@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import os
 import socket
-import subprocess
 import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from statistics import median
 from tempfile import TemporaryDirectory
 from typing import Any
 
@@ -167,40 +165,3 @@ def delays_us(settings: Config, record: Record) -> list[float]:
 def share(values: Sequence[float], part: float) -> float:
     """Return the quantile `part` (0 to 1) of the values, for example 0.99 for p99."""
     return sorted(values)[min(len(values) - 1, int(part * len(values)))]
-
-
-def in_turns(ways: Mapping[str, Callable[[], float]], rounds: int) -> dict[str, float]:
-    """Return the median of each program. Each round runs all programs in turn."""
-    values: dict[str, list[float]] = {name: [] for name in ways}
-    for _ in range(rounds):
-        for name, measure in ways.items():
-            values[name].append(measure())
-    return {name: median(results) for name, results in values.items()}
-
-
-def schedule(pid: int, policy: int, priority: int = 0) -> None:
-    """Set the kernel scheduling policy of every thread of a process.
-
-    Raises PermissionError if this user may not do that.
-    """
-    for task in os.listdir(f"/proc/{pid}/task"):
-        os.sched_setscheduler(int(task), policy, os.sched_param(priority))
-
-
-HOGS_S = 120
-"""A process that keeps a core busy ends by itself after this time, even if the test dies."""
-
-
-@contextmanager
-def all_cores_busy(wanted: bool) -> Iterator[None]:
-    """Run one busy loop per core while the body runs, if `wanted` is set."""
-    busy = f"import time\nend = time.monotonic() + {HOGS_S}\nwhile time.monotonic() < end: pass"
-    words = [sys.executable, "-c", busy]
-    number = len(os.sched_getaffinity(0)) if wanted else 0
-    hogs = [subprocess.Popen(words) for _ in range(number)]
-    try:
-        yield
-    finally:
-        for hog in hogs:
-            hog.kill()
-            hog.wait()
