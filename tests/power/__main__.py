@@ -4,20 +4,28 @@
     python -m tests.power baseline [--anew] [--minutes M] [--jobs 2]
     python -m tests.power mutants [--safety] [--only PATH [PATH ...]] [--sample N] [--seed 1]
 
-`compare` lists each item of `baseline.json` that tests noticed and do not notice any more. Its exit
-status is 1 if there is one. There are three scales: a fixed sample of mutants of the whole product,
-each hunk of the last commits that can still be undone, and the planted faults of `PLANTED.md`. An
-item whose code was deleted or rewritten is gone, not lost. `baseline` measures the items without a
-result, and `--anew` all items of this tree. `--scales` and `--only` choose some of them. A run that
-is ended loses at most the items under way, and the next run goes on.
+`baseline.json` has two scales: a fixed sample of mutants of the whole product, and each hunk of the
+500 commits before its own commit that could still be undone. For each item it names the test that
+noticed it. `not noticed` means that no test failed in 6 s of tests, the fastest first; `not
+reached`, that none executes it. Items of modules that were deleted since are not in the file.
 
-A mutant is the source with one small fault. `mutants` tries all mutants, or a sample, of the
-modules whose path contains a PATH, and with `--safety` of the modules in `SAFETY`. It lists each
-mutant that no test noticed, with the reason if `equivalent.py` says that no test can notice it. The
-exit status is 1 if the tests noticed less than 98 %.
+`compare` prints LOST for each item that a test noticed then and none notices now, and exits with 1
+if there is one. A change that deletes tests says for each lost item which line of the product's
+scope allows it, or adds a test. An item whose code was rewritten is gone, not lost. `baseline`
+measures the items without a result, and `--anew` all items of this tree. `--scales` and `--only`
+choose some. A run starts nothing after `--minutes`. It may be ended: it loses at most the items
+under way, and the next run goes on where it ended.
+
+A mutant has one changed, swapped or dropped piece of the syntax. A whole number above 20 changes by
+a quarter, because `499` for `500` says nothing about a test. An index and a smaller number change
+by 1. A fraction becomes a quarter larger or a fifth smaller. `mutants` tries all mutants, or a
+sample, of the modules whose path contains a PATH, and with `--safety` of those in `SAFETY`. It
+lists each mutant that no test noticed, with the reason if `equivalent.py` says that no test can
+notice it. The exit status is 1 if the tests noticed less than 98 %.
 
 All tests that run in this process take part (`TESTS` in `trials.py`). Run it as a user or in a
-container that can destroy nothing: a fault may be in code that deletes files or ends processes.
+container that can destroy nothing: a fault may be in code that deletes files or ends processes. The
+faults that the random plans must find are in `tests/simulate/PLANTED.md`.
 
 The tools mutmut and cosmic-ray are not suitable. mutmut (3.8) leaves out all code outside
 functions, which is every table and constant. Most mutants of cosmic-ray (8.7) are like `a << b` for
@@ -52,7 +60,7 @@ from tests.power.trials import NOBODY, UNDECIDED, UNREACHED, Trial, Trials, dige
 ROOT = Path(__file__).parents[2]
 BASELINE = Path(__file__).with_name("baseline.json")
 CACHE = ROOT / ".pytest_cache" / "power"
-SCALES = ("planted", "mutants", "hunks")
+SCALES = ("mutants", "hunks")
 SAFETY = (
     "acsard/core/guard.py",
     "acsard/core/motion/neutral.py",

@@ -1,4 +1,4 @@
-"""Three scales of the tests' power, their results in a file, and what a later tree has lost.
+"""Two scales of the tests' power, their results in a file, and what a later tree has lost.
 
 A result is the test that noticed the item, `NOBODY`, `UNREACHED`, `UNDECIDED`, or None if it
 was never tried.
@@ -6,16 +6,12 @@ was never tried.
 
 from __future__ import annotations
 
-import contextlib
 import hashlib
 import json
 import os
 import re
-import subprocess
-import sys
 from collections import Counter
-from collections.abc import Collection, Iterator
-from functools import partial
+from collections.abc import Collection
 from pathlib import Path
 
 from tests.power.equivalent import EQUIVALENT
@@ -46,30 +42,6 @@ def drawn(root: Path, only: Collection[str], seed: int) -> list[Trial]:
     return [trial for _, trial in sorted(lots, key=lambda pair: pair[0])]
 
 
-def planted(root: Path) -> Iterator[Trial]:
-    """Yield the faults that can be planted and that a recorded seed found."""
-    from tests.simulate.planted import edited, read
-    from tests.simulate.planted_cases import CASES
-    from tests.simulate.planted_faults import FAULTS
-
-    rows = read()
-    for fault in (*FAULTS, *CASES):
-        if fault.name in rows and rows[fault.name].seed:
-            with contextlib.suppress(OSError, ValueError):  # its code is not as it was
-                edited(fault)
-                play = partial(again, root, fault.name, rows[fault.name].seed)
-                yield Trial("planted", fault.name, "", frozenset(), str, run=play)
-
-
-def again(root: Path, name: str, seed: str) -> str:
-    """Play the recorded seed of a planted fault."""
-    words = [sys.executable, "-m", "tests.simulate.planted", "--again", "--only", name]
-    done = subprocess.run(words, cwd=root, capture_output=True, text=True, check=False)
-    if " rows hold;" not in done.stdout:
-        raise RuntimeError(done.stdout + done.stderr)
-    return NOBODY if f"\n{name}: seed " in f"\n{done.stdout}" else f"seed {seed}"
-
-
 def sample(pool: list[Trial], known: Collection[str]) -> list[Trial]:
     """Return the mutants with these names, or the first ones if there are none.
 
@@ -96,8 +68,6 @@ def present(
         found.append(sample(drawn(root, only, seed=1), known.get("mutants", ())))
     if "hunks" in scales:
         found.append(list(hunks(root)))
-    if "planted" in scales:
-        found.append(list(planted(root)))
     turns = [(at / len(items), item) for items in found for at, item in enumerate(items)]
     return [item for _, item in sorted(turns, key=lambda turn: turn[0])]
 

@@ -72,7 +72,6 @@ class Trial(NamedTuple):
         lines: The changed lines of the unchanged module, if they are in functions.
         text: Returns the changed source.
         first: The test that noticed the change before.
-        run: Finds the verdict without the tests here, if given.
     """
 
     scale: str
@@ -81,7 +80,6 @@ class Trial(NamedTuple):
     lines: frozenset[int]
     text: Callable[[], str]
     first: str = ""
-    run: Callable[[], str] | None = None
 
 
 def mirror(path: str) -> str:
@@ -358,7 +356,7 @@ class Trials:
         return 0
 
     def _judge(self, trial: Trial) -> int:
-        verdict = trial.run() if trial.run else self._noticed(trial)
+        verdict = self._noticed(trial)
         self._file(os.getpid()).write_text(verdict)
         return 0
 
