@@ -1,8 +1,7 @@
-"""Counts lost and damaged lines, and finds out in which direction lines are lost.
+"""Counts lost and damaged lines.
 
-A reply that arrives damaged was damaged on its way from the board. A line without a reply, or its
-reply, was lost. To tell which, the check sends pulses: single lines that turn the motors for a
-moment. If the motors obey, the reply was lost, and else the line.
+A reply that arrives damaged was damaged on its way from the board. If a line has no reply, either
+the line or its reply was lost. Of a board that reports by its own clock, only lost reports count.
 """
 
 from __future__ import annotations
@@ -13,7 +12,7 @@ from statistics import fmean, median
 from msgspec import Struct
 
 from acsard.checkup import lateness, motion, outcomes
-from acsard.checkup.board import Board, Operator
+from acsard.checkup.board import Board
 from acsard.checkup.findings import Finding, StoppedError
 from acsard.checkup.motion import ZERO, BoardReply
 from acsard.core.config.wire_time import COMFORTABLE_USE, highest_rate, line_bytes
@@ -121,108 +120,3 @@ def _silence_s(board: Board, replies: Sequence[BoardReply]) -> float:
     longest = max(motion.gaps(replies), default=0.0)
     quiet_s = max(0.1, 4 / board.rate_hz, 3 * board.mcu.reply_period)
     return longest if longest > max(quiet_s, SILENCE_FACTOR * board.gap_s) else 0.0
-
-
-# From a pulse to its zeros: long enough for the encoders, too short for the watchdog.
-PULSE_S = 0.08
-
-# Pulses are sent until this many had no reply, or for `MAX_PULSES_S`.
-MAX_UNANSWERED_PULSES, MAX_PULSES_S = 8, 20.0
-
-# Pulse n is followed by (n * `STRIDE`) % `SPREAD` more periods, because a link that loses every
-# tenth line might never lose an evenly spaced pulse.
-SPREAD, STRIDE = 12, 5
-
-# Of the median angle of the pulses: a smaller angle means that a pulse was lost.
-OBEYED_FRACTION = 0.5
-
-# The median angle, rad and in the smallest steps of the encoders, that shows which pulses arrived.
-MIN_PULSE_ANGLE, MIN_PULSE_STEPS = 0.02, 4
-
-
-class PulseCounts(Struct, frozen=True):
-    """Numbers of measured pulses, of pulses lost on their way, and of lost replies to pulses."""
-
-    sent: int
-    lost_out: int
-    lost_back: int
-
-
-def direction(board: Board, operator: Operator, motors: Sequence[int]) -> Finding | None:
-    """Find out whether lines or replies are lost, by `motors`, which turn briefly.
-
-    Return None for a prompted board that loses no more than `MAX_LOSS`.
-    """
-    if not (board.own_clock or board.lost > MAX_LOSS):
-        return None
-    operator.doing("the motors turn briefly, several times, to find out where lines are lost")
-    counts = pulsed(board, motors) if motors else None
-    if counts is None:
-        return outcomes.find("lost where: untold")
-    if counts.lost_out + counts.lost_back < MIN_LOST_LINES:
-        outcome = "not seen"
-    elif min(counts.lost_out, counts.lost_back) >= MIN_LOST_LINES:
-        outcome = "both"
-    else:
-        outcome = "there" if counts.lost_out > counts.lost_back else "back"
-    there, back = counts.lost_out, counts.lost_back
-    return outcomes.find(f"lost where: {outcome}", sent=counts.sent, there=there, back=back)
-
-
-def pulsed(board: Board, motors: Sequence[int]) -> PulseCounts | None:
-    """Send pulses from a standstill, and count the lost pulses and the lost replies.
-
-    Return None if the movement does not show which pulses arrived.
-    """
-    on = motion.only(motors)
-    # If the board reports by its own clock, no earlier step has found a loss of lines to the board,
-    # so a shorter search is enough.
-    end_s = board.now_s + (10.0 if board.own_clock else MAX_PULSES_S)
-    every: list[float] = []
-    unanswered: list[float] = []
-    count = 0
-    while len(unanswered) < MAX_UNANSWERED_PULSES and board.now_s < end_s:
-        # The reply to an earlier line must not be taken for the reply to this pulse.
-        board.listen(motion.SHORT_MEASUREMENT_S / 4)
-        since_s, coasting = board.now_s, board.replies[-1].motors
-        answered = bool(board.drive(on, PULSE_S, PULSE_S))
-        board.drive(ZERO, 2 * board.gap_s + (4 + STRIDE * count % SPREAD) * board.period_s)
-        if not _wait_until_still(board):
-            return None
-        count += 1
-        if board.own_clock and not _whole(board, since_s):
-            continue
-        ran, passed_s = motion.covered(board.replies, since_s), board.now_s - since_s
-        every.append(max(abs(ran[m]) - abs(coasting[m]) * passed_s for m in motors))
-        if not (answered or board.own_clock):
-            unanswered.append(every[-1])
-    usual = median(every) if every else 0.0
-    if usual < max(MIN_PULSE_ANGLE, MIN_PULSE_STEPS * _grain(board, motors)):
-        return None
-    if board.own_clock and len(every) < MAX_UNANSWERED_PULSES:
-        return None
-    if board.own_clock:
-        return PulseCounts(len(every), sum(angle < OBEYED_FRACTION * usual for angle in every), 0)
-    back = sum(angle >= OBEYED_FRACTION * usual for angle in unanswered)
-    return PulseCounts(len(every), len(unanswered) - back, back)
-
-
-def _whole(board: Board, since_s: float) -> bool:
-    gaps = motion.gaps(motion.since(board.replies, since_s - board.gap_s))
-    return all(gap_s < 1.5 * board.gap_s for gap_s in gaps)
-
-
-def _grain(board: Board, motors: Sequence[int]) -> float:
-    course = motion.steps(board.replies)
-    angles = [abs(step.speeds[m]) * step.seconds for step in course for m in motors]
-    return min((angle for angle in angles if angle), default=0.0)
-
-
-def _wait_until_still(board: Board) -> bool:
-    began_s = board.now_s
-    while board.turning():
-        if board.now_s - began_s > motion.MOTOR_TIMEOUT_S / 2:
-            board.stop_motors()
-            return False
-        board.send_zero()
-    return True

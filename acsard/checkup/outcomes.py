@@ -112,30 +112,13 @@ FAIL? lost lines: both | {share:.0%} of {lines}
     -> use a short cable away from the motors' leads, a common ground, or a lower baud rate at both
     ends
 FAIL? lost lines: either | {share:.0%} of {lines}
-    these lines had no answer: either the line or its answer was lost; see below
+    these lines had no answer: either the line or its answer was lost
     -> use a short cable away from the motors' leads, a common ground, or a lower baud rate at both
     ends
 FAIL? lost lines: silent | {share:.0%} of {lines}
     this share of the board's own reports did not arrive
     -> check the lead from the board's TX to the computer's RX; use a short cable away from the
     motors' leads, a common ground, or a lower baud rate at both ends
-
-PASS lost where: not seen | {sent} more lines sent, fewer than 2 lost
-FAIL? lost where: there | of {sent} lines, {there} lost on the way out, {back} on the way back
-    lines are lost on the way to the board: the motors did not follow these lines
-    -> check the lead from the computer's TX to the board's RX and the ground, or use a lower baud
-    rate; does the firmware read its buffer often enough?
-FAIL? lost where: back | of {sent} lines, {there} lost on the way out, {back} on the way back
-    answers are lost on their way back: the motors followed the lines
-    -> check the lead from the board's TX to the computer's RX and the ground, or use a lower baud
-    rate at both ends
-FAIL? lost where: both | of {sent} lines, {there} lost on the way out, {back} on the way back
-    lines and answers are lost
-    -> check first the ground of board and computer, then cable and plugs; or use a lower baud rate
-    at both ends
-SKIPPED? lost where: untold
-    the motors cannot show where lines are lost: they turn too slowly, their speeds are measured too
-    coarsely, or too many lines are lost
 
 PASS motor: right | {figure}
 WARN? motor: off | {figure}

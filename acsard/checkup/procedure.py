@@ -186,7 +186,6 @@ class _Steps:
         self._take("", lambda: dialect.comma(board, channels[-1].kind in ("dead", "late")))
         self._take("", lambda: wheel_map(board.mcu, channels))
         right = [channel.motor for channel in channels if channel.kind in ("right", "off")]
-        self._measure("", lambda: line_loss.direction(board, operator, right))
         self._take("", lambda: encoder_counts.finding(board, right))
         together = "the motors turn, then this computer sends nothing, perhaps several times"
         self._measure(together, lambda: watchdog.finding(board, right))
