@@ -23,7 +23,6 @@ from msgspec import Struct
 from msgspec.structs import asdict
 
 from acsard.core.values import ROLES, Role
-from acsard.host import clock
 from acsard.host.atomic_file import replace
 from acsard.host.errors import MSGSPEC_ERRORS, MendableError, NotPermittedError, UsageError
 from acsard.web.callers import AdmittedClient
@@ -35,8 +34,6 @@ SERVICE_DIRECTORY = Path("/var/lib/acsard-web")
 
 # of one robot
 MAX_TOKENS = 200
-
-WRITE_INTERVAL_S = 60  # of the time in the token file: more writes would wear out an SD card
 
 
 class Token(Struct, frozen=True):
@@ -52,26 +49,17 @@ class Token(Struct, frozen=True):
 
 class _File(Struct, frozen=True):
     tokens: list[dict[str, Any]]  # a record that is not a valid `Token` is kept and admits nobody
-    newest: int = 0  # the newest time that a server has seen, s since 1970
 
 
 class Vault:
     """The access tokens of one robot. The token file also contains tokens of other robots.
 
-    The clock of a robot without a battery begins in 1970 at each start. An expired token stays
-    expired, because the time is the clock's or the newest in the file, whichever is later. The
-    latter goes on, or no token would ever expire on a robot that never learns the time.
+    The clock of a robot without a battery may begin in 1970 at each start. An expired token stays
+    expired, because the server deletes it.
     """
 
     def __init__(self, directory: Path, robot: str) -> None:
         self.path, self.robot = directory / FILE, robot
-        self._newest = 0.0, clock.steady_s()  # time of a file, and when it was read, s
-        self._stored_s = 0  # time in the file, s
-
-    def now_s(self) -> float:
-        """Return the time of the tokens, s, as of the last call that read the token file."""
-        newest_s, read_s = self._newest
-        return max(time.time(), newest_s + clock.steady_s() - read_s)
 
     def all(self) -> list[Token]:
         """Return this robot's tokens, also expired ones; [] if the file cannot be read."""
@@ -81,13 +69,14 @@ class Vault:
             return []
 
     def valid(self) -> list[Token]:
-        """Return the tokens that are valid now, and store the time in the file if that is due."""
-        tokens, now_s = self.all(), self.now_s()
-        if tokens and now_s >= self._stored_s + WRITE_INTERVAL_S:
+        """Return the tokens that are valid now, and delete the expired ones."""
+        tokens, now_s = self.all(), time.time()
+        valid = [token for token in tokens if token.ends > now_s]
+        if len(valid) < len(tokens):
             # Without room on the disk, the tokens expire by the clock alone.
             with suppress(MendableError, NotPermittedError, UsageError), self._changing():
                 pass
-        return [token for token in tokens if token.ends > now_s]
+        return valid
 
     def unknown_to(self, service: Path = SERVICE_DIRECTORY) -> str:
         """Return a warning if the service `acsard-web` reads another token file, else ""."""
@@ -101,13 +90,10 @@ class Vault:
     def invite(self, role: Role, name: str, days: int, hours: int = 0) -> tuple[str, Token]:
         """Create a token, and return its text, which is stored nowhere, and its record.
 
-        Expired tokens are deleted. Raises `UsageError` for a name in use, or for too many tokens.
+        Raises `UsageError` for a name in use, or for too many tokens.
         """
         with self._changing() as rows:
-            now_s = int(self.now_s())
-            rows[:] = [
-                row for row in rows if (record := _token(row)) is None or record.ends > now_s
-            ]
+            now_s = int(time.time())
             ours = self._own(rows)
             if any(record.name == name for record in ours):
                 raise UsageError(
@@ -148,14 +134,11 @@ class Vault:
     def _load(self) -> tuple[dict[str, Any], _File]:
         # Fields that only a later version knows are written back.
         raw = msgspec.json.decode(self.path.read_bytes(), type=dict[str, Any])
-        file = msgspec.convert(raw, _File)
-        self._stored_s = file.newest
-        if file.newest > self.now_s():
-            self._newest = file.newest, clock.steady_s()
-        return raw, file
+        return raw, msgspec.convert(raw, _File)
 
     @contextmanager
     def _changing(self) -> Iterator[list[dict[str, Any]]]:
+        """Lock the file, delete the expired tokens, and write the file after the `with` block."""
         directory = self.path.parent
         try:
             directory.mkdir(mode=0o700, parents=True, exist_ok=True)
@@ -166,8 +149,9 @@ class Vault:
                     raw, file = self._load()
                 except FileNotFoundError:
                     raw, file = {}, _File([])
-                yield file.tokens
-                self._write(raw | {"tokens": file.tokens, "newest": int(self.now_s())})
+                tokens = [token for token in file.tokens if not _has_expired(token)]
+                yield tokens
+                self._write(raw | {"tokens": tokens})
             finally:
                 os.close(handle)
         except PermissionError:
@@ -238,7 +222,7 @@ class ReadTokens:
     def left_s(self, digest: str) -> int:
         """Return the time until a token expires; 0 if it is not valid."""
         token = self._known.get(digest)
-        return 0 if token is None else max(0, math.ceil(token.ends - self._vault.now_s()))
+        return 0 if token is None else max(0, math.ceil(token.ends - time.time()))
 
 
 def _token(row: dict[str, Any]) -> Token | None:
@@ -246,6 +230,11 @@ def _token(row: dict[str, Any]) -> Token | None:
         return msgspec.convert(row, Token)
     except msgspec.ValidationError:
         return None
+
+
+def _has_expired(row: dict[str, Any]) -> bool:
+    token = _token(row)
+    return token is not None and token.ends <= time.time()
 
 
 def _digest(text: str) -> str:
