@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import threading
 from collections import Counter
-from collections.abc import Iterator, Mapping
-from typing import get_args
+from collections.abc import Iterable, Mapping
+from typing import Any, get_args
 
 from prometheus_client import CONTENT_TYPE_LATEST, generate_latest
-from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily
+from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
 from prometheus_client.registry import Collector
 
 from acsard.core.link.link_state import State
@@ -20,40 +20,45 @@ from acsard.web.callers import Reason
 
 CONTENT_TYPE = CONTENT_TYPE_LATEST
 
-Family = GaugeMetricFamily | CounterMetricFamily
-
-Samples = Mapping[str, float] | Mapping[tuple[str, ...], float]  # by the values of the labels
-
 
 class Metrics(Collector):
     """The metrics of one robot, all with the label `robot`."""
 
     def __init__(self, robot: str) -> None:
         self._robot = robot
-        self._families: list[Family] = []
+        self._families: list[Metric] = []
 
-    def collect(self) -> Iterator[Family]:
-        yield from self._families
+    def collect(self) -> list[Metric]:
+        return self._families
 
     def gauge(self, name: str, what: str, value: float | None) -> None:
-        if value is not None:
-            family = GaugeMetricFamily(f"acsard_{name}", what, labels=("robot",))
-            family.add_metric((self._robot,), value)
+        self.gauges(name, what, (), {(): value})
+
+    def gauges(
+        self,
+        name: str,
+        what: str,
+        labels: tuple[str, ...],
+        samples: Mapping[Any, float | None],
+    ) -> None:
+        """Add a sample for each known value, by the values of its labels."""
+        family = GaugeMetricFamily(f"acsard_{name}", what, labels=("robot", *labels))
+        for words, value in samples.items():
+            if value is not None:
+                family.add_metric((self._robot, *words), value)
+        if family.samples:
             self._families.append(family)
 
-    def gauges(self, name: str, what: str, labels: tuple[str, ...], samples: Samples) -> None:
-        family = GaugeMetricFamily(f"acsard_{name}", what, labels=("robot", *labels))
-        self._add(family, samples)
+    def one_of(self, name: str, what: str, label: str, values: Iterable[str], now: object) -> None:
+        """Add a sample for each of the values: 1 for the present one, else 0."""
+        samples = {(value,): float(value == now) for value in values}
+        self.gauges(name, f"1 for {what}, else 0", (label,), samples)
 
     def counters(self, name: str, what: str, label: str, counts: Mapping[str, int]) -> None:
         family = CounterMetricFamily(f"acsard_{name}", what, labels=("robot", label))
-        self._add(family, {word: float(count) for word, count in sorted(counts.items())})
-
-    def _add(self, family: Family, samples: Samples) -> None:
-        for words, value in samples.items():
-            labels = (words,) if isinstance(words, str) else words
-            family.add_metric((self._robot, *labels), value)
-        if samples:
+        for word, count in sorted(counts.items()):
+            family.add_metric((self._robot, word), count)
+        if counts:
             self._families.append(family)
 
 
@@ -76,7 +81,7 @@ def text(
     metrics.gauge("up", "1 while the daemon's messages arrive, else 0", float(is_reachable))
     if state is not None and is_reachable:
         what = "always 1; the label `version` is the version of the daemon"
-        metrics.gauges("info", what, ("version",), {version: 1.0})
+        metrics.gauges("info", what, ("version",), {(version,): 1.0})
         _add_state(metrics, state)
     metrics.gauge("page_viewers", "pages and programs connected", viewers)
     metrics.counters("page", "actions of the page's server, by kind", "what", counts)
@@ -86,13 +91,11 @@ def text(
 
 
 def _add_state(metrics: Metrics, state: RobotState) -> None:
-    modes = {mode.value: float(mode.value == state.mode) for mode in Mode}
-    metrics.gauges("mode", "1 for the robot's present mode, else 0", ("mode",), modes)
-    what = "1 for the present state of the link to the microcontroller, else 0"
-    links = {link: float(link == state.link) for link in get_args(State)}
-    metrics.gauges("link", what, ("state",), links)
+    metrics.one_of("mode", "the robot's present mode", "mode", Mode, state.mode)
+    what = "the present state of the link to the microcontroller"
+    metrics.one_of("link", what, "state", get_args(State), state.link)
     warned = {item.what for item in warnings(state)}
-    subjects: dict[str, float] = {kind: float(kind in warned) for kind in WARNING_KINDS}
+    subjects = {(kind,): float(kind in warned) for kind in WARNING_KINDS}
     metrics.gauges("warning", "1 while the robot gives this warning, else 0", ("what",), subjects)
     if state.certificate_days is not None:
         what = "seconds until the next expiry of a TLS certificate"
@@ -100,7 +103,7 @@ def _add_state(metrics: Metrics, state: RobotState) -> None:
     if state.emergency_stop:
         what = "1 while the emergency stop counts as pressed, else 0"
         metrics.gauge("emergency_stop", what, float(state.emergency_stop != "released"))
-    bumpers = {str(number): float(one) for number, one in enumerate(state.bumpers or (), 1)}
+    bumpers = {(str(number),): float(one) for number, one in enumerate(state.bumpers or (), 1)}
     what = "1 while the bumper counts as pressed, else 0"
     metrics.gauges("bumper", what, ("bumper",), bumpers)
     if (battery := state.battery) is not None:
@@ -109,15 +112,14 @@ def _add_state(metrics: Metrics, state: RobotState) -> None:
         metrics.gauge("battery_amperes", what, battery.amps)
         share = None if battery.percent is None else 0.01 * battery.percent
         metrics.gauge("battery_charge_ratio", "state of charge, 0 to 1", share)
-    if state.linear is not None and state.angular is not None:
-        metrics.gauge("linear_speed_mps", "measured, forward", state.linear)
-        metrics.gauge("angular_speed_radps", "measured; left is positive", state.angular)
-    pose = {"x": state.x, "y": state.y, "yaw": state.yaw}
+    metrics.gauge("linear_speed_mps", "measured, forward", state.linear)
+    metrics.gauge("angular_speed_radps", "measured; left is positive", state.angular)
+    pose = {("x",): state.x, ("y",): state.y, ("yaw",): state.yaw}
     metrics.gauges("pose", "pose in the frame odom, in m and rad", ("axis",), pose)
-    wheels = dict(zip(WHEELS, state.wheels, strict=False))
+    wheels = {(wheel,): speed for wheel, speed in zip(WHEELS, state.wheels, strict=False)}
     metrics.gauges("wheel_speed_radps", "measured", ("wheel",), wheels)
     metrics.counters("robot", "the daemon's counters", "what", state.counters)
-    latencies: dict[tuple[str, ...], float] = {
+    latencies = {
         (name, at): getattr(latency.last_minute, at) * 1e-6
         for name, latency in state.latencies.items()
         for at in ("p50", "p99", "max")
