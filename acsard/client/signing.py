@@ -49,12 +49,14 @@ class CommandSigner:
     def sign(self, stamp_ns: Ns | None, echo: Beat | None, *, zero: bool = False) -> Signature:
         """Return the signature of the next command, with its sequence number.
 
-        A zero gets a later stamp of this sender, so that it is not refused as older.
+        A zero gets a stamp after all others of this sender, so that it is not refused as older,
+        even if the sender's clock advances in coarse steps.
         """
         self._sequence += 1
         # The daemon refuses a command whose stamp is older than that of an earlier command. If a
         # sender uses two sources, its commands may be signed in another order than their stamps.
         if stamp_ns is not None:
-            newest_ns = max(stamp_ns, self._newest_ns)
-            self._newest_ns, stamp_ns = newest_ns, newest_ns if zero else stamp_ns
+            if zero:
+                stamp_ns = max(stamp_ns, self._newest_ns + 1)
+            self._newest_ns = max(stamp_ns, self._newest_ns)
         return Signature(self._id, stamp_ns, self._sequence, echo)

@@ -59,8 +59,8 @@ STATUS_TEXTS = {
 # Not in a request for a path that is open to every client.
 IDENTITY_KEY: web.RequestKey[AdmittedClient] = web.RequestKey("who", AdmittedClient)
 
-# Why the connection of this request ends after the answer, or "".
-LAST_KEY: web.RequestKey[str] = web.RequestKey("last", str)
+# Whether the connection of this request ends after the answer.
+LAST_KEY: web.RequestKey[bool] = web.RequestKey("last", bool)
 
 Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
 
@@ -114,7 +114,7 @@ class Access:
 
     @web.middleware
     async def _serve(self, request: web.Request, handler: Handler) -> web.StreamResponse:
-        with connection_of(request).serving(request.content):
+        with connection_of(request).serving():
             answer = await self._answer(request, handler)
         if request.get(LAST_KEY):
             answer.force_close()
@@ -174,7 +174,7 @@ class Access:
             self._connections.end(identity.token, FLOOD_TEXT, but=connection)
             refusal = RequestRefusedError("too_fast", f"requests with this token: {FLOOD_TEXT}")
         if refusal is not None:
-            request[LAST_KEY] = str(refusal)
+            request[LAST_KEY] = True
             if row is None or not row.always:
                 raise refusal
 

@@ -10,8 +10,6 @@ import asyncio
 import base64
 import gzip
 import hashlib
-import os
-from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import msgspec
@@ -21,10 +19,6 @@ from msgspec import Struct
 from acsard.core.values import AcsardError
 from acsard.web.callers import Reason
 from acsard.web.routes import JSON, Problem
-
-READ_TIMEOUT_S = 10.0
-
-PIECE_BYTES = 32768
 
 # By the reason of a refusal; 403 for any other one.
 STATUS_CODES: dict[Reason, int] = {
@@ -82,26 +76,6 @@ def file_answer(request: web.Request, file: File) -> web.Response:
     if file.packed is not None and "gzip" in request.headers.get("Accept-Encoding", ""):
         body, headers["Content-Encoding"] = file.packed, "gzip"
     return web.Response(body=body, headers=headers | {"Content-Type": file.kind})
-
-
-async def sent_in_pieces(
-    request: web.Request, body: bytes, headers: Mapping[str, str], within: float
-) -> web.StreamResponse:
-    """Send a large body without copying it, and cut the connection after `within` s."""
-    if request.method == "HEAD":
-        return web.Response(body=body, headers=headers)
-    answer = web.StreamResponse(headers=headers)
-    answer.content_length = len(body)
-    try:
-        async with asyncio.timeout(within):
-            await answer.prepare(request)
-            for begin in range(0, len(body), PIECE_BYTES):
-                await answer.write(memoryview(body)[begin : begin + PIECE_BYTES])
-    except TimeoutError:
-        cut(request.transport)
-    except ConnectionError:
-        pass  # the client has gone; aiohttp notices
-    return answer
 
 
 def cut(transport: asyncio.BaseTransport | None) -> None:
@@ -178,54 +152,29 @@ class File(Struct, frozen=True):
     packed: bytes | None  # gzip; None if that is not shorter
     tag: str
     policy: str  # Appended to `POLICY`: allows the inserted scripts and styles.
-    stamp: tuple[tuple[int, int], ...]  # (mtime ns, bytes) of this file and of the inserted ones
 
 
-class Files:
-    """The page's files, as of the last reading of the disk."""
+def page_files(directory: Path = PAGE_DIRECTORY) -> dict[str, File]:
+    """Return the files of the page by name, without hidden ones and symbolic links.
 
-    def __init__(self, directory: Path = PAGE_DIRECTORY) -> None:
-        self._directory = directory
-        self._files: dict[str, File] = {}
-        self.read()
-
-    def get(self, name: str) -> File | None:
-        return self._files.get(name)
-
-    def read(self) -> None:
-        """Read the files that have changed on the disk. Symbolic links are not followed."""
-        try:
-            with os.scandir(self._directory) as entries:
-                files = [entry for entry in entries if entry.is_file(follow_symlinks=False)]
-                stats = {entry.name: entry.stat() for entry in files}
-        except OSError:
-            stats = {}
-        stamps = {name: (stat.st_mtime_ns, stat.st_size) for name, stat in stats.items()}
-        read = {name: self._read(name, stamps) for name in stamps}
-        self._files = {name: file for name, file in read.items() if file is not None}
-
-    def _read(self, name: str, stamps: Mapping[str, tuple[int, int]]) -> File | None:
-        kind, parts = CONTENT_TYPES.get(Path(name).suffix), (name, *INLINED.get(name, ()))
-        if kind is None or name.startswith(".") or not all(part in stamps for part in parts):
-            return None
-        known, stamp = self._files.get(name), tuple(stamps[part] for part in parts)
-        if known is not None and known.stamp == stamp:
-            return known
-        try:
-            return _load_file([self._directory / part for part in parts], kind, stamp)
-        except OSError:
-            return None
+    The server reads them once: a version that is installed later may not fit this server.
+    """
+    files = [path for path in directory.iterdir() if path.is_file() and not path.is_symlink()]
+    return {
+        path.name: _load_file(path, CONTENT_TYPES[path.suffix])
+        for path in files
+        if path.suffix in CONTENT_TYPES and not path.name.startswith(".")
+    }
 
 
-def _load_file(paths: Sequence[Path], kind: str, stamp: tuple[tuple[int, int], ...]) -> File:
-    whole, *parts = paths
-    body, policy = whole.read_bytes(), ""
-    for part in parts:
-        source, (loads, element) = part.read_bytes(), INLINED[whole.name][part.name]
+def _load_file(path: Path, kind: str) -> File:
+    body, policy = path.read_bytes(), ""
+    for name, (loads, element) in INLINED.get(path.name, {}).items():
+        source = path.with_name(name).read_bytes()
         body = body.replace(loads, f"<{element}>".encode() + source + f"</{element}>".encode())
         digest = base64.b64encode(hashlib.sha256(source).digest()).decode()
         policy += f"; {element}-src 'self' 'sha256-{digest}'"
     # Compression does not pay for a small file.
     packed = gzip.compress(body, mtime=0) if len(body) >= 1000 else body
     tag = f'"{hashlib.sha256(body).hexdigest()[:32]}"'
-    return File(kind, body, packed if len(packed) < len(body) else None, tag, policy, stamp)
+    return File(kind, body, packed if len(packed) < len(body) else None, tag, policy)

@@ -28,10 +28,10 @@ from acsard.host import clock
 from acsard.host.errors import MendableError, NoAnswerError
 from acsard.machine.kept_settings import can_be_kept
 from acsard.web import metrics, openapi
-from acsard.web.access import IDENTITY_KEY, LAST_KEY, Access, connection_of, own_port, peer_of
-from acsard.web.answers import Files, TroubleError, file_answer, reply, sent_in_pieces
+from acsard.web.access import IDENTITY_KEY, Access, connection_of, own_port, peer_of
+from acsard.web.answers import TroubleError, file_answer, page_files, reply
 from acsard.web.callers import PROTOCOL, RequestRefusedError, cookie_name, tokens_offered
-from acsard.web.camera import SEND_TIMEOUT_S, Camera
+from acsard.web.camera import Camera
 from acsard.web.connections import Connections
 from acsard.web.recordings import BlackBox, Recording
 from acsard.web.routes import FORM, JSON, RECORDINGS_ROLE, Body, Problem, Route, services, values
@@ -59,7 +59,6 @@ class Caller(Struct, frozen=True):
 
     role: Role
     name: str
-    full: Annotated[str, Meta(description='why the caller cannot open a WebSocket now, or ""')]
 
 
 class Setting(Struct, frozen=True, omit_defaults=True):
@@ -91,7 +90,7 @@ class Page:
         rules: WebConfig,
     ) -> None:
         self._parts, self._tokens, self._connections = parts, tokens, connections
-        self._robot, self.files = parts.robot, Files()
+        self._robot, self._files = parts.robot, page_files()
         self._box = BlackBox(parts.robot)
         self._camera = Camera(rules.camera)
         self._has_camera = bool(rules.camera)
@@ -124,7 +123,7 @@ class Page:
         return await self._send(request, request.match_info["name"])
 
     async def _send(self, request: web.Request, name: str) -> web.StreamResponse:
-        file = self.files.get(name)
+        file = self._files.get(name)
         if file is None:
             raise web.HTTPNotFound
         return file_answer(request, file)
@@ -177,7 +176,7 @@ class Page:
         await served.prepare(request)
         _limit_buffer(request)
         viewer = Viewer(served, request, identity, self._parts, camera=self._has_camera)
-        connection_of(request).become_socket(viewer.end)
+        connection_of(request).end = viewer.end
         self._viewers.add(viewer)
         try:
             await viewer.run()
@@ -200,9 +199,7 @@ class Page:
 
     async def whoami(self, request: web.Request) -> web.StreamResponse:
         identity = request[IDENTITY_KEY]
-        # A browser does not report to its page why a WebSocket was refused, so `full` reports it
-        # here.
-        return reply(Caller(identity.role, identity.name, request.get(LAST_KEY, "")))
+        return reply(Caller(identity.role, identity.name))
 
     async def value(self, request: web.Request) -> web.StreamResponse:
         return reply(msgspec.Raw(await self._value(request.path.removeprefix("/api/"))))
@@ -229,11 +226,12 @@ class Page:
         _limit_buffer(request)
         headers = {
             "Content-Type": "image/jpeg",
+            "Content-Length": str(len(picture.body)),
             "ETag": f'"{picture.number}"',
             "Age-Ms": str((clock.steady_ns() - picture.at_ns) // 1_000_000),
             "Waited-Ms": str((clock.steady_ns() - begun_ns) // 1_000_000),
         }
-        return await sent_in_pieces(request, picture.body, headers, SEND_TIMEOUT_S)
+        return web.Response(body=picture.pieces(), headers=headers)
 
     async def recordings(self, request: web.Request) -> web.StreamResponse:
         return reply(await self._box.rows())
@@ -340,7 +338,7 @@ ROUTES: tuple[Route, ...] = (
         gives={101: Body("The WebSocket is open.", media="")}),
     Route("GET", "/api", "viewer", Page.api, "this document", gives={200: Body("OpenAPI 3.1.")}),
     Route("GET", "/api/whoami", "viewer", Page.whoami, "the caller's role and name",
-        gives={200: Body("The caller.", Caller)}, always=True),
+        gives={200: Body("The caller.", Caller)}),
     Route("GET", "/api/settings", least_role("config"), Page.settings,
         "the settings that srv/set accepts: values, ranges, and whether each may change while the "
         "robot moves",

@@ -34,9 +34,6 @@ MAX_PICTURE, READ_BYTES = 1_000_000, 65536
 # Of a connection, and of aiohttp's parser for a stream that is damaged or is not MJPEG.
 STREAM_ERRORS = (aiohttp.ClientError, HttpProcessingError, OSError, ValueError)
 
-# The page in the browser waits no longer.
-SEND_TIMEOUT_S = 5.0
-
 
 class Picture(Struct, frozen=True):
     """One JPEG picture, its number, and its arrival on the clock `steady_ns`."""
@@ -44,6 +41,11 @@ class Picture(Struct, frozen=True):
     body: bytes
     number: int
     at_ns: Ns
+
+    async def pieces(self) -> AsyncIterator[bytes]:
+        """Yield the picture in pieces, so that clients that read slowly share one copy of it."""
+        for begin in range(0, len(self.body), READ_BYTES):
+            yield self.body[begin : begin + READ_BYTES]
 
 
 async def pictures(content_type: str, stream: aiohttp.StreamReader) -> AsyncIterator[bytes]:

@@ -16,13 +16,12 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Never, Protocol
 
-from aiohttp import StreamReader, web
+from aiohttp import web
 
 from acsard.host.rate_limits import Places
 from acsard.web.answers import HEADERS, cut, problem, unsent_bytes
 from acsard.web.callers import is_loopback, network_of, unmapped
 from acsard.web.metrics import Counts
-from acsard.web.tasks import start
 
 # From other machines, in total and from each network (`network_of`), and from the robot itself.
 # asyncio gives each TLS connection buffers of about 0.3 MB. A browser opens seven connections.
@@ -36,9 +35,6 @@ HANDSHAKE_S, IDLE_S, UNREAD_S = 3.0, 8.0, 5.0
 
 # Read buffer of a connection, and the answers that may wait for a client that reads slowly.
 READ_BYTES, WRITE_BYTES = 16384, 65536
-
-# Requests behind the present one: more than any client sends that waits for its answers.
-MAX_WAITING_BYTES = 131072
 
 # Of a request. A browser sends the cookies for all ports of a host in one header, so less could
 # lock it out.
@@ -58,7 +54,7 @@ class Connections:
         self.counts = counts
         self._away = Places(MAX_CONNECTIONS, MAX_OF_NETWORK)
         self._here = Places(MAX_LOCAL, MAX_LOCAL)
-        self._all, self._opening = set[HttpConnection](), set[asyncio.Task[None]]()
+        self._all = set[HttpConnection]()
         self._of_token: dict[str, list[HttpConnection]] = {}
 
     async def accept(
@@ -82,15 +78,17 @@ class Connections:
             if places.enter(network_of(peer)):
                 connection = HttpConnection(self, server, peer, places)
                 self._all.add(connection)
-                start(self._open(connection, accepted, certificate), self._opening)
+                opening = self._open(connection, accepted, certificate)
+                connection.opening = asyncio.create_task(opening)
             else:
                 self.counts.refuse("crowded", peer)
                 accepted.close()
 
     def close(self) -> None:
         """End the connections that are not open yet."""
-        for task in self._opening:
-            task.cancel()
+        for connection in self._all:
+            if connection.opening is not None:
+                connection.opening.cancel()
 
     def claim(self, connection: HttpConnection, token: str) -> bool:
         """Count a connection for the token of its request.
@@ -187,11 +185,11 @@ class HttpConnection(web.RequestHandler):
         )
         self.peer, self.places = peer, places
         self.token = ""  # digest of the token for which this connection counts
+        self.opening: asyncio.Task[None] | None = None
+        # Ends the connection for a reason, which a WebSocket sends to its client.
         self.end: Callable[[str], None] = lambda why: self.cut()
         self._connections = connections
-        self._serves, self._is_socket = False, False
-        self._body: StreamReader | None = None
-        self._waiting_bytes = 0
+        self._serves = False
 
     @property
     def is_busy(self) -> bool:
@@ -199,17 +197,13 @@ class HttpConnection(web.RequestHandler):
         return self._serves or unsent_bytes(self.transport) > 0
 
     @contextmanager
-    def serving(self, body: StreamReader) -> Iterator[None]:
+    def serving(self) -> Iterator[None]:
         """Serve a request during a `with` block."""
-        self._serves, self._body, self._waiting_bytes = True, body, 0
+        self._serves = True
         try:
             yield
         finally:
             self._serves = False
-
-    def become_socket(self, end: Callable[[str], None]) -> None:
-        """Note that a WebSocket is open, which `end` closes with a reason."""
-        self.end, self._is_socket = end, True
 
     def cut(self) -> None:
         cut(self.transport)
@@ -218,17 +212,6 @@ class HttpConnection(web.RequestHandler):
         assert isinstance(transport, asyncio.Transport)
         transport.set_write_buffer_limits(WRITE_BYTES)
         super().connection_made(transport)
-
-    def data_received(self, data: bytes) -> None:
-        # aiohttp limits how much of a body and of a WebSocket it keeps.
-        in_body = self._body is not None and not self._body.is_eof()
-        if not (in_body or self._is_socket):
-            self._waiting_bytes += len(data)
-        if self._waiting_bytes > MAX_WAITING_BYTES:
-            self._connections.counts.refuse("crowded", self.peer)
-            self.cut()
-        else:
-            super().data_received(data)
 
     def connection_lost(self, exc: BaseException | None) -> None:
         super().connection_lost(exc)

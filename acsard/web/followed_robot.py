@@ -1,13 +1,16 @@
-"""Connects to the daemon of the page's robot, follows the robot's state, and detects silence."""
+"""Connects to the daemon of the page's robot, follows the robot's state, and detects silence.
+
+This work has a thread of its own, which may wait for the bus. The event loop reads its results.
+"""
 
 from __future__ import annotations
 
-import asyncio
 import math
+import time
 from collections import deque
 from collections.abc import Callable, Mapping
 from contextlib import suppress
-from typing import Any, TypeVar
+from typing import Any
 
 import msgspec
 import zenoh
@@ -18,21 +21,13 @@ from acsard.bus.tls import shown_at
 from acsard.client.connection import Connection
 from acsard.client.follower import Watch, restarted
 from acsard.core.config.settings import RatesConfig
-from acsard.core.messages.encodings import DecodeError, Decoder
-from acsard.core.messages.schema import Info, PoseStamped, RobotState, Twist, TwistStamped
-from acsard.core.values import NS_PER_S, Ns
+from acsard.core.messages.encodings import DecodeError
+from acsard.core.messages.schema import Info, RobotState
 from acsard.host import clock
 from acsard.host.errors import MendableError, UnreachableError
-from acsard.host.threads import NoThreadError, in_thread
-from acsard.web.last_minute import Minute, Plotted
+from acsard.host.threads import in_thread
 from acsard.web.metrics import Counts
-from acsard.web.streams import (
-    DECLARE_TIMEOUT_S,
-    NOT_READY_ERRORS,
-    RETRY_DELAY_S,
-    Stream,
-    Streams,
-)
+from acsard.web.streams import RETRY_DELAY_S, Streams
 
 PROCESS_PERIOD_S = 0.1
 
@@ -44,8 +39,6 @@ PATH_S, PATH_POINTS, PATH_STEP_M = 600.0, 5000, 0.05
 
 # No robot drives so far between two states: its pose was set, and the path begins again.
 PATH_JUMP_M = 1.0
-
-T = TypeVar("T")
 
 # Blocks until the daemon is connected. Raises `UnreachableError`.
 Connect = Callable[[], Connection]
@@ -83,22 +76,9 @@ class PathHistory:
 
     def points(self) -> list[tuple[float, float]]:
         """Return the points (x, y), m, in the order of time; the last is the newest position."""
-        places = [(x, y) for _, x, y in self._points] + ([self._last] if self._last else [])
+        points = self._points.copy()  # another thread adds points meanwhile
+        places = [(x, y) for _, x, y in points] + ([self._last] if self._last else [])
         return [(round(x, 3), round(y, 3)) for x, y in places]
-
-
-class _TaskQueries:
-    def __init__(self, client: Connection) -> None:
-        self.subscribe, self._client = client.subscribe, client
-        self._asked: asyncio.Task[None] | None = None
-
-    def start_query(self, name: str, take: Callable[[zenoh.Sample], object]) -> None:
-        if self._asked is None or self._asked.done():
-            self._asked = asyncio.create_task(self._query(name, take))
-
-    async def _query(self, name: str, take: Callable[[zenoh.Sample], object]) -> None:
-        with suppress(*NOT_READY_ERRORS):
-            await in_thread(lambda: self._client.start_query(name, take), None)
 
 
 class FollowedRobot:
@@ -116,141 +96,66 @@ class FollowedRobot:
         self.streams = Streams(lambda: self.client)
         # why the robot is not reachable, or ""
         self.gone = f"no daemon answers at {address.endpoint} yet"
+        self.state: RobotState | None = None  # the newest one
+        self.path = PathHistory()  # in the odom frame
         self._connect, self._counts = connect, counts
-        self._paths = {"path": PathHistory(), "truth": PathHistory()}
-        self._minute = Minute()
-        self._poses, self._wishes = Decoder(PoseStamped), Decoder(TwistStamped)
-        self._refresh_requested = asyncio.Event()
-        self._watch: Watch | None = None
+        self._about_due_s, self._is_leaving = 0.0, False
 
     async def run(self) -> None:
-        """Connect to the robot's daemon again and again, and process its states until cancelled.
-
-        Raises `MendableError` if another attempt cannot help.
-        """
-        client = self.client = await self._reached()
-        asking = asyncio.create_task(self._ask_again_and_again())
+        """Follow the robot until cancelled. Raises `MendableError` if it cannot be followed."""
         try:
-            await self._follow(await self._watch_state(client))
+            await in_thread(self._run, None)
         finally:
-            asking.cancel()
-
-    @property
-    def state(self) -> RobotState | None:
-        """Newest state, or None before the first."""
-        return None if self._watch is None else self._watch.state
+            self._is_leaving = True
 
     def refresh_about(self) -> None:
         """Query `about` before the next regular query."""
-        self._refresh_requested.set()
+        self._about_due_s = 0.0
 
-    def paths(self) -> dict[str, list[tuple[float, float]]]:
-        """Return the paths of the last ten minutes, points (x, y) in m.
-
-        "path" is the path in the odom frame, and "truth" the true one of a simulated robot.
-        """
-        return {name: path.points() for name, path in self._paths.items()}
-
-    def minute(self) -> Plotted:
-        return self._minute.plotted(clock.steady_ns())
-
-    async def _reached(self) -> Connection:
-        while True:
+    def _run(self) -> None:
+        while self.client is None:
             try:
-                return await in_thread(self._connect, None)
+                self.client = self._connect()
             except UnreachableError as error:
                 self.gone = str(error)
-            except NoThreadError as error:
-                self.gone = f"{error}; the page tries again by itself"
-            await asyncio.sleep(RETRY_DELAY_S)
+                time.sleep(RETRY_DELAY_S)
+        watch = Watch(self.client, clock.steady_s())
+        while not self._is_leaving:
+            self._look(watch, clock.steady_s())
+            if not self.gone and clock.steady_s() >= self._about_due_s:
+                self._about_due_s = clock.steady_s() + ABOUT_PERIOD_S
+                self._query_about(self.client)
+            time.sleep(PROCESS_PERIOD_S)
 
-    async def _watch_state(self, client: Connection) -> Watch:
-        def watch() -> Watch:
-            return Watch(_TaskQueries(client), clock.steady_s())
+    def _look(self, watch: Watch, now: float) -> None:
+        unreadable = watch.unreadable
+        with suppress(zenoh.ZError):  # the session is closed, so the robot is silent
+            for state in watch.poll(now):
+                if restarted(self.state, state):
+                    self.path = PathHistory()
+                self.path.add(now, state.x, state.y)
+                self.state = state
+        if watch.unreadable > unreadable:
+            self._counts.add("unreadable", watch.unreadable - unreadable)
+        quiet = watch.silent(now)
+        if quiet and watch.unreadable:
+            self.gone = (
+                "the daemon's state cannot be read: does the daemon run another version of "
+                "acsard? Use the same version here"
+            )
+        elif quiet and (watch.is_confirmed or not self.gone):
+            self.gone = (
+                f"nothing is received from the daemon at {self.endpoint}: does the "
+                "daemon run? `acsard doctor` on the robot finds the cause"
+            )
+        elif watch.is_confirmed and not quiet and self.gone:
+            self.gone = ""
+            self.refresh_about()
 
-        while True:
-            try:
-                return await in_thread(watch, DECLARE_TIMEOUT_S, Watch.end)
-            except NOT_READY_ERRORS as error:
-                why = str(error) if isinstance(error, NoThreadError) else "the Zenoh bus is stuck"
-                self.gone = f"{why}; the page tries again by itself"
-                await asyncio.sleep(RETRY_DELAY_S)
-
-    async def _follow(self, watch: Watch) -> None:
-        self._watch, truth = watch, None
-        while True:
-            now_ns = clock.steady_ns()
-            before, unreadable, now = watch.state, watch.unreadable, now_ns / NS_PER_S
-            with suppress(zenoh.ZError):  # the session is closed, so the robot is silent
-                for state in watch.poll(now):
-                    self._take(before, state, now_ns)
-                    before = state
-            if watch.unreadable > unreadable:
-                self._counts.add("unreadable", watch.unreadable - unreadable)
-            quiet = watch.silent(now)
-            if quiet and watch.unreadable:
-                self.gone = (
-                    "the daemon's state cannot be read: does the daemon run another version of "
-                    "acsard? Use the same version here"
-                )
-            elif quiet and (watch.is_confirmed or not self.gone):
-                self.gone = (
-                    f"nothing is received from the daemon at {self.endpoint}: does the "
-                    "daemon run? `acsard doctor` on the robot finds the cause"
-                )
-            elif watch.is_confirmed and not quiet and self.gone:
-                self.gone = ""
-                self.refresh_about()
-            if self.about.simulated and truth is None:
-                truth = self.streams.follow("sim/pose")
-            if truth is not None:
-                self._take_truth(truth, now_ns)
-            await asyncio.sleep(PROCESS_PERIOD_S)
-
-    def _take(self, before: RobotState | None, state: RobotState, now_ns: Ns) -> None:
-        if restarted(before, state):
-            self._paths = {name: PathHistory() for name in self._paths}
-        self._paths["path"].add(now_ns / NS_PER_S, state.x, state.y)
-        if self._minute.due(now_ns):
-            self._minute.add(now_ns, state, self._wished(now_ns))
-
-    def _wished(self, now_ns: Ns) -> Twist | None:
-        stream = self.streams.followed("cmd_vel_out")
-        raw = None if stream is None else stream.raw()
-        # A twist that is older than 2 s does not belong to the row that is plotted now.
-        if stream is None or raw is None or now_ns - stream.at_ns > 2 * NS_PER_S:
-            return None
+    def _query_about(self, client: Connection) -> None:
         try:
-            return self._wishes.decode(*raw).twist
-        except DecodeError:
-            return None
-
-    def _take_truth(self, truth: Stream, now_ns: Ns) -> None:
-        raw = truth.raw()
-        if raw is None:
-            return
-        try:
-            at = self._poses.decode(*raw).pose.position
-        except DecodeError:
-            return
-        self._paths["truth"].add(now_ns / NS_PER_S, at.x, at.y)
-
-    async def _ask_again_and_again(self) -> None:
-        while True:
-            self._refresh_requested.clear()
-            answered = await self._query_robot()
-            try:
-                async with asyncio.timeout(ABOUT_PERIOD_S if answered else ABOUT_RETRY_S):
-                    await self._refresh_requested.wait()
-            except TimeoutError:
-                pass
-
-    async def _query_robot(self) -> bool:
-        client = self.client
-        assert client is not None
-        try:
-            info: Info = await in_thread(lambda: client.get("info"), None)
-            config: dict[str, Any] = await in_thread(lambda: client.get("config"), None)
+            info: Info = client.get("info")
+            config: dict[str, Any] = client.get("config")
             self.about = About(
                 info.version,
                 info.simulated,
@@ -264,8 +169,7 @@ class FollowedRobot:
                 },
             )
         except (
-            MendableError, NoThreadError, DecodeError, msgspec.MsgspecError, KeyError, TypeError,
+            MendableError, DecodeError, msgspec.MsgspecError, zenoh.ZError, KeyError, TypeError,
             ValueError,
         ):  # fmt: skip
-            return False
-        return True
+            self._about_due_s = clock.steady_s() + ABOUT_RETRY_S

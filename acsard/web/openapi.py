@@ -31,9 +31,8 @@ TO_ROBOT, FROM_ROBOT = "ToRobot", "FromRobot"
 VALUE_PREFIX = "Value."
 
 SENT_MESSAGES = (
-    socket_messages.Hello, socket_messages.DrivenPath, socket_messages.LastMinute,
-    socket_messages.Answer, socket_messages.Pong, socket_messages.Refused,
-    socket_messages.DaemonUnreachable,
+    socket_messages.Hello, socket_messages.DrivenPath, socket_messages.Answer,
+    socket_messages.Pong, socket_messages.Refused, socket_messages.DaemonUnreachable,
 )  # fmt: skip
 
 # Message types of the keys to which clients can subscribe.

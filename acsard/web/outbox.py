@@ -1,4 +1,4 @@
-"""Sends the commands of several viewers from one thread, so that no caller waits for the bus.
+"""Sends the commands of all viewers from one thread, so that no caller waits for the bus.
 
 The ride of a viewer happens in its page or program, which has the zeros at the beginning and the
 end. Each viewer has a `Relay`, which keeps only its newest command and never repeats one: the robot
@@ -11,16 +11,22 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from concurrent.futures import Future
-from threading import Condition
+from functools import partial
+from queue import SimpleQueue
+from threading import Event, Lock
 from typing import Never
 
 from msgspec import Struct
 
+from acsard.client.connection import Connection
 from acsard.client.ride import MAX_SOURCE_TIMEOUT_S, STALE_S
+from acsard.client.signing import CommandSigner
+from acsard.core.messages import schema
 from acsard.core.messages.schema import Beat
 from acsard.core.values import NS_PER_S, REST, Ns, Twist
 from acsard.host import clock
 from acsard.host.threads import Worker
+from acsard.web.metrics import Counts
 
 
 class Wish(Struct, frozen=True):
@@ -32,26 +38,24 @@ class Wish(Struct, frozen=True):
 
 
 class Relay:
-    """Keeps the newest command of one sender. A zero is sent even if it is old."""
+    """Keeps the newest command of one sender to a source. A zero is sent even if it is old."""
 
-    def __init__(self) -> None:
-        self.replaced = self.stale = 0  # not sent: replaced by a newer one; too old
+    def __init__(self, source: str, signer: CommandSigner) -> None:
+        self.source, self.signer = source, signer
         self._wish: Wish | None = None
         self._last = Wish(REST)  # sent or not
         self._came_ns: Ns = 0  # newest command
         self._moved_ns: Ns | None = None  # a speed was last sent; None after a zero
 
-    def take(self, wish: Wish, now_ns: Ns) -> None:
-        """Store a command, which replaces one that waits."""
-        if self._wish is not None:
-            self.replaced += 1
-        self._wish = self._last = wish
-        self._came_ns = now_ns
-
     @property
     def waits(self) -> bool:
         """Whether a command waits to be sent."""
         return self._wish is not None
+
+    def take(self, wish: Wish, now_ns: Ns) -> None:
+        """Store a command, which replaces one that waits."""
+        self._wish = self._last = wish
+        self._came_ns = now_ns
 
     def send(self, now_ns: Ns) -> Wish | None:
         """Return the command to send now, or None; drop a speed that is old."""
@@ -60,7 +64,6 @@ class Relay:
             return None
         moves = wish.twist != REST
         if moves and now_ns - self._came_ns > STALE_S * NS_PER_S:
-            self.stale += 1
             return None
         self._moved_ns = now_ns if moves else None
         return wish
@@ -84,67 +87,66 @@ class Relay:
         return Wish(REST, stamp_ns, self._last.echo)
 
 
-Put = Callable[[Wish], object]  # sends one command, and may block
-
-
 class Outbox:
-    def __init__(self, dropped: Callable[[], object] = lambda: None) -> None:
-        # `dropped` is called for each command that `Relay.send` drops.
-        self._dropped = dropped
-        self._senders: dict[Relay, Put] = {}
-        self._zeros: list[tuple[Put, Wish]] = []
-        self._news = Condition()
-        self._busy = False
-        # Gets an exception that ends the thread; otherwise pending.
+    """Sends the newest command of each relay on the bus, once, signed by its viewer."""
+
+    def __init__(self, client: Callable[[], Connection | None], counts: Counts) -> None:
+        self._client, self._counts = client, counts
+        self._queue = SimpleQueue[Callable[[], object]]()  # has each relay that waits once
+        self._lock = Lock()  # of all relays
+        # Gets an exception that ends the thread; otherwise pending. The server then must exit: it
+        # cannot stop the robot any more when a viewer disconnects.
         self.dead: Future[Never] = Future()
         Worker("outbox", self._run, self.dead.set_exception).start()
 
-    def take(self, relay: Relay, put: Put, wish: Wish) -> None:
-        """Queue a sender's command, which the thread sends by `put`."""
-        with self._news:
+    def take(self, relay: Relay, wish: Wish) -> None:
+        """Queue a command, which replaces an unsent one of its relay."""
+        with self._lock:
+            waits = relay.waits
             relay.take(wish, clock.steady_ns())
-            self._senders[relay] = put
-            self._news.notify_all()
+        if waits:
+            self._counts.add("commands_superseded")
+        else:
+            self._queue.put(partial(self._send, relay))
 
     def release(self, relay: Relay, timeout_s: float = MAX_SOURCE_TIMEOUT_S) -> None:
-        """Remove a sender, and queue a zero if the robot may still follow it."""
-        with self._news:
-            put = self._senders.pop(relay, None)
+        """End the drive of a relay, and queue a zero if the robot may still follow it."""
+        with self._lock:
             zero = relay.end(clock.steady_ns(), timeout_s)
-            if put is not None and zero is not None:
-                self._zeros.append((put, zero))
-            self._news.notify_all()
+        if zero is not None:
+            self._queue.put(partial(self._publish, relay, zero))
 
     def flush(self, seconds: float) -> None:
         """Wait until all queued commands have been sent, but at most `seconds`."""
-        with self._news:
-            self._news.wait_for(
-                lambda: not (self._busy or self._zeros or self._waiting()), timeout=seconds
-            )
+        sent = Event()
+        self._queue.put(sent.set)
+        sent.wait(seconds)
 
     def _run(self) -> None:
         while True:
-            self._round()
+            self._queue.get()()
 
-    def _round(self) -> None:
-        with self._news:
-            self._busy = False
-            self._news.notify_all()
-            while not ((waiting := self._waiting()) or self._zeros):
-                self._news.wait()
-            self._busy = True
-            zeros, self._zeros = self._zeros, []
-        for put, zero in zeros:
-            put(zero)
-        for relay, put in waiting:
-            # The bus may have blocked the previous command, so read the clock again for the age.
-            with self._news:
-                stale = relay.stale
-                wish = relay.send(clock.steady_ns())
-            if wish is not None:
-                put(wish)
-            elif relay.stale > stale:
-                self._dropped()
+    def _send(self, relay: Relay) -> None:
+        with self._lock:
+            waits, wish = relay.waits, relay.send(clock.steady_ns())
+        if wish is not None:
+            self._publish(relay, wish)
+        elif waits:
+            self._counts.add("commands_dropped")
 
-    def _waiting(self) -> list[tuple[Relay, Put]]:
-        return [(relay, put) for relay, put in self._senders.items() if relay.waits]
+    def _publish(self, relay: Relay, wish: Wish) -> None:
+        try:
+            client = self._client()
+            if client is not None:
+                twist = schema.Twist(
+                    schema.Vector3(x=wish.twist.linear), schema.Vector3(z=wish.twist.angular)
+                )
+                zero = wish.twist == REST
+                # An echo of this server would hide how late the viewer's command is.
+                signature = relay.signer.sign(wish.stamp_ns, wish.echo, zero=zero)
+                client.put(twist, signature, relay.source)
+                self._counts.add("commands")
+                return
+        except Exception:  # noqa: BLE001, S110 - only this command is lost, not the thread of all viewers
+            pass
+        self._counts.add("commands_dropped")

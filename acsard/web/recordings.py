@@ -14,9 +14,12 @@ from msgspec import Meta, Struct
 from acsard.host.threads import in_thread
 from acsard.recording.directory import NAME_TIME_FORMAT, is_being_recorded
 from acsard.recording.file import first_head, listed
-from acsard.web.answers import READ_TIMEOUT_S, TroubleError
+from acsard.web.answers import TroubleError
 from acsard.web.callers import RequestRefusedError, is_loopback
 from acsard.web.followed_robot import FollowedRobot
+
+# For a disk.
+READ_TIMEOUT_S = 10.0
 
 T = TypeVar("T")
 

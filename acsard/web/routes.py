@@ -63,8 +63,7 @@ class Route(Struct, frozen=True):
     takes: type | str | None = None  # type, or name of a bus message in `SCHEMAS`
     forms: tuple[str, ...] = (JSON,)  # media types of the body
     gives: Mapping[int, Body] = {}  # by HTTP status; any other one gives a `Problem`
-    # Served even if the client's token has too many connections or requests. The connection ends
-    # after the answer.
+    # A stop is answered even if its token has too many connections or requests.
     always: bool = False
 
     @property

@@ -91,7 +91,7 @@ async def serve(
         assert runner.server is not None
         stack.push_async_callback(runner.cleanup)
         work = [leaving.wait(), robot.run(), _tick(page, tokens, counts, log)]
-        work.append(_read_disk(tokens, page, certificate))
+        work.append(_read_disk(tokens, certificate))
         if options.supervised:
             work.append(_watch_parent(leaving))
         places = open_sockets(options.listen, options.supervised)
@@ -101,10 +101,10 @@ async def serve(
             work.append(connections.accept(runner.server, opened, tls))
         stack.callback(connections.close)
         announce([address for address, _ in places])
-        await first_ended(work, parts.commands.outbox)
+        await first_ended(work, parts.outbox)
         page.end_all("the page's server ends")
         await asyncio.sleep(0)
-        await asyncio.to_thread(parts.commands.outbox.flush, SHUTDOWN_S)
+        await asyncio.to_thread(parts.outbox.flush, SHUTDOWN_S)
 
 
 async def first_ended(work: Iterable[Coroutine[Any, Any, object]], outbox: Outbox) -> None:
@@ -130,10 +130,9 @@ async def _tick(page: Page, tokens: ReadTokens, counts: Counts, log: Log) -> Non
             log.event(refusals)
 
 
-async def _read_disk(tokens: ReadTokens, page: Page, certificate: Certificate | None) -> None:
+async def _read_disk(tokens: ReadTokens, certificate: Certificate | None) -> None:
     def read() -> None:
         tokens.read()
-        page.files.read()
         if certificate is not None:
             certificate.read()
 

@@ -17,8 +17,6 @@ import msgspec
 from aiohttp import web
 
 from acsard.core.messages.keys_and_roles import BEAT
-from acsard.host import clock
-from acsard.host.rate_limits import Buckets, Rate
 from acsard.web.answers import cut, unsent_bytes
 from acsard.web.callers import Reason
 from acsard.web.metrics import Counts
@@ -31,9 +29,6 @@ MAX_UNREAD_BYTES = 32768
 
 # Sum of all keys of a WebSocket. More would take processor time from the commands.
 MAX_FRAMES_HZ = 300.0
-
-# Of reports about refused messages, for each kind of message and each reason.
-REPORT_RATE = Rate(1.0)
 
 
 class Following:
@@ -66,15 +61,20 @@ class Outgoing:
         self._streams, self._origin = streams, origin
         self.following: dict[str, Following] = {}  # by key
         # The queue is limited, because the client may have stopped reading.
-        self._out: deque[bytes] = deque(maxlen=200)
-        self._pong: bytes | None = None  # payload of the newest unanswered ping
+        self._out: deque[tuple[bytes, aiohttp.WSMsgType]] = deque(maxlen=200)
         self._news, self._loop = asyncio.Event(), asyncio.get_running_loop()
-        self._reports = Buckets(REPORT_RATE)
         self._closing = False
 
     def enqueue(self, message: object) -> None:
         """Queue a message. If more than 200 wait, the oldest one is dropped."""
-        self._out.append(msgspec.json.encode(message))
+        self._queue(msgspec.json.encode(message), aiohttp.WSMsgType.TEXT)
+
+    def pong(self, data: bytes) -> None:
+        """Queue the answer to a ping, like a message."""
+        self._queue(data, aiohttp.WSMsgType.PONG)
+
+    def _queue(self, data: bytes, kind: aiohttp.WSMsgType) -> None:
+        self._out.append((data, kind))
         self._news.set()
 
     def _wake_from_thread(self) -> None:
@@ -82,10 +82,9 @@ class Outgoing:
             self._loop.call_soon_threadsafe(self._news.set)
 
     def refuse(self, what: str, reason: Reason, text: str) -> None:
-        """Count a refused message, and report it to the client within `REPORT_RATE`."""
+        """Count a refused message, and report it to the client."""
         self._counts.refuse(reason, self._origin)
-        if self._reports.take(f"{what} {reason}", clock.mono_ns()):
-            self.enqueue(Refused(what, text))
+        self.enqueue(Refused(what, text))
 
     def subscribe(self, key: str, rate: float) -> None:
         """Subscribe to a key or change its rate, or report to the client why not."""
@@ -160,33 +159,19 @@ class Outgoing:
         with suppress(ConnectionError):
             await self._socket.send_frame(payload, aiohttp.WSMsgType.CLOSE)
 
-    def pong(self, data: bytes) -> None:
-        """Queue the answer to a ping.
-
-        It replaces an unsent one, so a client that reads nothing cannot fill the memory.
-        """
-        self._pong = data
-        self._news.set()
-
     async def _send(self, data: bytes, kind: aiohttp.WSMsgType = aiohttp.WSMsgType.TEXT) -> None:
-        await self._send_beat()
-        await self._send_frame(data, kind)
-
-    async def _send_frame(self, data: bytes, kind: aiohttp.WSMsgType) -> None:
         if not self._closing:  # no data may follow a close frame
             await self._socket.send_frame(data, kind)
 
     async def _send_beat(self) -> None:
         beats = self.following.get(BEAT)
         if beats is not None and beats.stream.number != beats.sent:
-            await self._send_frame(beats.next(), aiohttp.WSMsgType.TEXT)
+            await self._send(beats.next())
 
     async def _send_what_waits(self) -> None:
-        if self._pong is not None:
-            data, self._pong = self._pong, None
-            await self._send(data, aiohttp.WSMsgType.PONG)
         while self._out:
-            await self._send(self._out.popleft())
+            await self._send_beat()
+            await self._send(*self._out.popleft())
 
     async def _send_due(self, subscription: Following, now: float) -> float:
         if subscription.name == BEAT:
@@ -199,5 +184,6 @@ class Outgoing:
             if unsent_bytes(self._transport) > MAX_UNREAD_BYTES:
                 self._counts.add("frames_left_out")
             else:
+                await self._send_beat()
                 await self._send(subscription.next())
         return subscription.due

@@ -22,7 +22,6 @@ from acsard.core.messages.keys_and_roles import FOLLOWED
 from acsard.host import clock
 from acsard.host.errors import UsageError
 from acsard.host.threads import in_thread
-from acsard.web.tasks import start
 
 Take = Callable[[zenoh.Sample], None]
 
@@ -45,17 +44,13 @@ class Stream:
         self._newest: tuple[int, zenoh.Sample | None, int] = (0, None, 0)
         self._text: tuple[int, bytes] = (0, b"null")
         self.users, self.unused = 0, asyncio.Event()
+        self.serving: asyncio.Task[None] | None = None
         self.wakes: set[Callable[[], object]] = set()  # called for each message, in any thread
 
     @property
     def number(self) -> int:
         """Number of messages so far, and of the newest one."""
         return self._newest[0]
-
-    @property
-    def at_ns(self) -> int:
-        """Arrival of the newest message on the clock `steady_ns`."""
-        return self._newest[2]
 
     def take(self, sample: zenoh.Sample) -> None:
         with self._taking:
@@ -76,11 +71,6 @@ class Stream:
             self._text = number, as_json(*encoded(sample))
         return number, self._text[1], max(0.0, (clock.steady_ns() - at_ns) / 1e6)
 
-    def raw(self) -> tuple[str, bytes] | None:
-        """Return the newest message as (encoding, payload)."""
-        sample = self._newest[1]
-        return None if sample is None else encoded(sample)
-
 
 class Streams:
     """Subscriptions to keys of the robot, each shared by all its users."""
@@ -88,7 +78,6 @@ class Streams:
     def __init__(self, client: Callable[[], Connection | None]) -> None:
         self._client = client  # None before the daemon is connected
         self._streams: dict[str, Stream] = {}
-        self._tasks: set[asyncio.Task[None]] = set()
 
     def follow(self, key: str) -> Stream:
         """Return the stream of a key, for which the caller must call `leave` later.
@@ -98,13 +87,9 @@ class Streams:
         stream = self._streams.get(key)
         if stream is None:
             stream = self._streams[key] = Stream()
-            start(self._serve(key, stream), self._tasks)
+            stream.serving = asyncio.create_task(self._serve(key, stream))
         stream.users += 1
         return stream
-
-    def followed(self, key: str) -> Stream | None:
-        """Return the stream of a key that has a user."""
-        return self._streams.get(key)
 
     def leave(self, key: str) -> None:
         """Remove one user of a key; the subscription ends with the last one."""

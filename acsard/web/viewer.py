@@ -7,20 +7,15 @@ the robot.
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable, Coroutine
-from functools import partial
-from typing import Any
 
 import aiohttp
 from aiohttp import web
 
-from acsard.client.connection import Connection
 from acsard.client.ride import MAX_SOURCE_TIMEOUT_S
 from acsard.client.signing import CommandSigner
-from acsard.core.messages import schema
 from acsard.core.messages.permissions import COMMAND_ROLE, SERVICE_ROLES
 from acsard.core.messages.signature import public_name
-from acsard.core.values import REST, Role, Twist
+from acsard.core.values import Role, Twist
 from acsard.host import clock
 from acsard.host.own_identity import sender_id
 from acsard.host.rate_limits import Bucket
@@ -45,7 +40,6 @@ from acsard.web.socket_messages import (
     decode,
 )
 from acsard.web.socket_sender import Outgoing
-from acsard.web.tasks import start
 
 # The page disables the controls of the actions that its user's role does not allow.
 ACTIONS: dict[str, Role] = {
@@ -58,50 +52,12 @@ ACTIONS: dict[str, Role] = {
 PING_INTERVAL_S = 10.0
 
 
-class ViewerCommands:
-    """Sends the newest velocity command of each viewer on the bus, once and with the viewer's
-    stamp.
-
-    The server itself creates only zeros, for a viewer that was driving and has disconnected.
-    """
-
-    def __init__(self, client: Callable[[], Connection | None], counts: Counts) -> None:
-        self._client, self._counts = client, counts
-        # If an error ends its thread, the server must exit: it cannot stop the robot any more when
-        # a viewer disconnects.
-        self.outbox = Outbox(partial(counts.add, "commands_dropped"))
-
-    def give(self, source: str, relay: Relay, sender: CommandSigner, wish: Wish) -> None:
-        """Queue a command, which replaces an unsent one."""
-        replaced = relay.replaced
-        self.outbox.take(relay, partial(self._publish, source, sender), wish)
-        if relay.replaced > replaced:
-            self._counts.add("commands_superseded")
-
-    def _publish(self, source: str, sender: CommandSigner, wish: Wish) -> None:
-        try:
-            client = self._client()
-            if client is not None:
-                twist = schema.Twist(
-                    schema.Vector3(x=wish.twist.linear), schema.Vector3(z=wish.twist.angular)
-                )
-                zero = wish.twist == REST
-                # An echo of this server would hide how late the viewer's command is.
-                signature = sender.sign(wish.stamp_ns, wish.echo, zero=zero)
-                client.put(twist, signature, source)
-                self._counts.add("commands")
-                return
-        except Exception:  # noqa: BLE001, S110 - only this command is lost, not the thread of all viewers
-            pass
-        self._counts.add("commands_dropped")
-
-
 class Parts:
     """What `Page` and all viewers share, such as the connection to the daemon."""
 
     def __init__(self, robot: FollowedRobot, counts: Counts, config: str | None = None) -> None:
         self.robot, self.counts = robot, counts
-        self.commands = ViewerCommands(lambda: robot.client, counts)
+        self.outbox = Outbox(lambda: robot.client, counts)
         self.calls = Calls(robot, config)
 
 
@@ -118,26 +74,25 @@ class Viewer:
         camera: bool,
     ) -> None:
         self.who, self._camera = who, camera
-        self._robot, self._commands, self._calls = parts.robot, parts.commands, parts.calls
+        self._robot, self._outbox, self._calls = parts.robot, parts.outbox, parts.calls
         self._counts = parts.counts
         whole = sender_id(who.name)
-        self._sender, self._relays = CommandSigner(whole), dict[str, Relay]()
+        self._signer, self._relays = CommandSigner(whole), dict[str, Relay]()
         # Public name, in `state.sender` while the client drives; the sender id stays secret.
         self.sender = public_name(whole, parts.robot.certificate)
         self._socket = socket
         self._bucket = Bucket(REQUEST_RATE)
         self._out = Outgoing(socket, request, parts.robot.streams, parts.counts, who.origin)
-        self._tasks: set[asyncio.Task[None]] = set()
-        self._stops: set[asyncio.Task[None]] = set()
+        # A call, the stops and the end, each while it is under way.
+        self._calling: asyncio.Task[None] | None = None
+        self._stopping: asyncio.Task[None] | None = None
+        self._ending: asyncio.Task[None] | None = None
         self._stop_ids: list[int | str] = []
-        self._ended = self._is_calling = self._is_stopping = False
-        self._stamp_ns = -1  # of the last command
         self._unreachable_reason, self._about = "", parts.robot.about
 
     async def run(self) -> None:
         self._greet()
-        self._out.enqueue(socket_messages.DrivenPath(**self._robot.paths()))
-        self._out.enqueue(socket_messages.LastMinute(self._robot.minute()))
+        self._out.enqueue(socket_messages.DrivenPath(self._robot.path.points()))
         pump = asyncio.create_task(self._out.pump(self._look_around))
         try:
             async for message in self._socket:
@@ -149,8 +104,8 @@ class Viewer:
             # Stop the robot first, because this viewer may have been driving.
             self._release()
             pump.cancel()
-            for task in list(self._tasks):
-                task.cancel()
+            if self._calling is not None:
+                self._calling.cancel()
             self._out.unsubscribe_all()
 
     def end(self, why: str) -> None:
@@ -158,16 +113,14 @@ class Viewer:
 
         The client receives the reason, at most 120 characters.
         """
-        if self._ended:
-            return
-        self._ended = True
-        self._release()
-        self._start(self._out.close(why))
+        if self._ending is None:
+            self._release()
+            self._ending = asyncio.create_task(self._out.close(why))
 
     # Incoming messages.
 
     def _take(self, message: aiohttp.WSMessage) -> None:
-        if self._ended:  # after the close frame, only a stop counts
+        if self._ending is not None:  # after the close frame, only a stop counts
             is_text = message.type == aiohttp.WSMsgType.TEXT
             if is_text and not self._stop_ids and asks_to_stop(message.data):
                 self._obey(Call("stop"))
@@ -224,59 +177,37 @@ class Viewer:
             text = f"{frame.source} is not one of the robot's sources: {names}"
             self._out.refuse("cmd", "malformed", text)
             return
-        stamp_ns = frame.stamp_ns
-        if stamp_ns is not None:
-            if stamp_ns == self._stamp_ns and not frame.moves:
-                # The clock of some clients advances in coarse steps. So a zero with the stamp of
-                # the last command may still mean that the user has released the control. Accept it
-                # with a later stamp.
-                stamp_ns += 1
-            if stamp_ns <= self._stamp_ns:
-                self._out.refuse(
-                    "cmd", "replayed", "`stamp` must be later than the previous command's stamp"
-                )
-                return
-            self._stamp_ns = stamp_ns
         twist = Twist(frame.cmd.linear_x, frame.cmd.angular_z)
-        wish = Wish(twist, stamp_ns, frame.echo)
-        relay = self._relays.setdefault(frame.source, Relay())
-        self._commands.give(frame.source, relay, self._sender, wish)
+        relay = self._relays.setdefault(frame.source, Relay(frame.source, self._signer))
+        self._outbox.take(relay, Wish(twist, frame.stamp_ns, frame.echo))
 
     def _release(self) -> None:
         timeouts = self._robot.about.timeouts
         for source, relay in self._relays.items():
-            self._commands.outbox.release(relay, timeouts.get(source, MAX_SOURCE_TIMEOUT_S))
+            self._outbox.release(relay, timeouts.get(source, MAX_SOURCE_TIMEOUT_S))
 
     def _call(self, frame: Call) -> None:
         if frame.call == "stop":
             self._stop_ids.append(frame.id)
-            if not self._is_stopping:
-                self._is_stopping = True
-                # Keep it in a separate set of tasks, which continue when the connection ends.
-                start(self._stop(), self._stops)
-        elif self._is_calling:
+            if self._stopping is None or self._stopping.done():
+                # It continues when the connection ends.
+                self._stopping = asyncio.create_task(self._stop())
+        elif self._calling is not None and not self._calling.done():
             self._counts.refuse("too_fast", self.who.origin)
             text = "another call of this WebSocket is under way: wait for its answer"
             self._out.enqueue(socket_messages.Answer(frame.id, False, text))
         else:
-            self._is_calling = True
-            self._start(self._answer(frame))
+            self._calling = asyncio.create_task(self._answer(frame))
 
     async def _stop(self) -> None:
-        try:
-            while self._stop_ids:  # all that arrived during one stop share the next
-                ids, self._stop_ids = self._stop_ids, []
-                ok, text = await self._reply(Call("stop"))
-                for number in ids:
-                    self._out.enqueue(socket_messages.Answer(number, ok, text))
-        finally:
-            self._is_stopping = False
+        while self._stop_ids:  # all that arrived during one stop share the next
+            ids, self._stop_ids = self._stop_ids, []
+            ok, text = await self._reply(Call("stop"))
+            for number in ids:
+                self._out.enqueue(socket_messages.Answer(number, ok, text))
 
     async def _answer(self, frame: Call) -> None:
-        try:
-            ok, text = await self._reply(frame)
-        finally:
-            self._is_calling = False
+        ok, text = await self._reply(frame)
         self._out.enqueue(socket_messages.Answer(frame.id, ok, text))
 
     async def _reply(self, frame: Call) -> tuple[bool, str]:
@@ -317,6 +248,3 @@ class Viewer:
         if self._robot.about is not self._about:
             self._greet()
         return now + 0.25
-
-    def _start(self, work: Coroutine[Any, Any, None]) -> None:
-        start(work, self._tasks)

@@ -1281,64 +1281,6 @@ def test_curves_that_overlap_are_distinguishable_and_show_their_values(page: Pho
     until(lambda: browser.js(SEEN) == 4, 20.0, "four colours")
 
 
-LEGEND = "document.querySelector('#plot-speed + .legend').textContent"
-
-ABOVE = """(() => {
-    const canvas = document.getElementById('plot-speed'), paper = canvas.getContext('2d');
-    const {width, height} = canvas, look = getComputedStyle(document.documentElement);
-    const {data} = paper.getImageData(0, 0, width, height);
-    const is = (name) => {
-        paper.fillStyle = look.getPropertyValue(name).trim();
-        const [, ...rgb] = /#(..)(..)(..)/.exec(paper.fillStyle);
-        return (n) => rgb.every((one, at) => data[n + at] === parseInt(one, 16));
-    };
-    return ['--accent', '--wished'].map(is).map((colour) => {
-        let count = 0;
-        for (let n = 0; n < data.length / 2; n += 4) if (colour(n)) count++;
-        return count;
-    });
-})()"""
-"""Number of points of the measured and of the commanded speed in the upper half of their plot."""
-
-
-@alone
-@pytest.mark.nightly
-def test_the_plots_begin_with_the_minute_before(
-    page: Phone,
-) -> None:
-    """A client drives the robot before a page is open, and again while one is open.
-
-    Then the page is opened again and shows the measured speeds. It has commanded speeds only from
-    the time in which a page was open.
-    """
-    browser, bus = page.browser, page.bus
-    browser.open("about:blank")
-    until(lambda: viewers(page) == 0, 5.0, "no page is open")
-    with bus.commanding(0.4, 0.0):
-        until(lambda: bus.state()["x"] > 1.5, 10.0, "for some seconds")
-    bus.at_rest()
-
-    def looked() -> tuple[int, int]:
-        """Open the page again. Return the numbers of measured and of commanded plot points."""
-        browser.open(page.server.here)
-        page.shows("mode", "READY")
-        browser.tap("tab-status")
-        until(lambda: "0.00" in browser.js(LEGEND), 5.0, "the plots are drawn")
-        measured, wished = browser.js(ABOVE)
-        return measured, wished
-
-    measured, wished = looked()
-    assert measured > 20
-    assert wished == 0
-    with bus.commanding(0.4, 0.0):
-        until(lambda: (bus.state()["linear"] or 0.0) > 0.35, 10.0, "it drives")
-    bus.at_rest()
-    measured, wished = looked()
-    assert measured > 20
-    assert wished > 0
-    assert browser.said == []
-
-
 SEEN = """(() => {
     const canvas = document.getElementById('plot-wheels'), paper = canvas.getContext('2d');
     const {width, height} = canvas, style = getComputedStyle(document.documentElement);

@@ -348,21 +348,21 @@ async def _introduce_sender(ours: Hands, bus: Bus) -> None:
 
 
 @pytest.mark.parametrize(
-    ("what", "late_s", "by", "reason"),
+    ("what", "late_s", "reason"),
     [
-        ("100 stamps from before", 5.0, "page", "replayed"),
+        ("100 stamps from before", 5.0, "command_stale"),
         # Early stamps that went on for the source's timeout, 0.25 s, would be a clock that was set.
-        ("8 stamps of tomorrow", -86400.0, "robot", "command_early"),
+        ("8 stamps of tomorrow", -86400.0, "command_early"),
     ],
 )
 async def test_a_command_with_a_stale_or_future_stamp_is_not_obeyed(
-    table: Table, bus: Bus, what: str, late_s: float, by: str, reason: str
+    table: Table, bus: Bus, what: str, late_s: float, reason: str
 ) -> None:
     number = int(what.split()[0])
     async with hands(table.page) as ours:
         await _introduce_sender(ours, bus)
-        answer = "not handed on" if by == "page" else "not obeyed"
-        with table.attack(what, answer, reason, number, by):
+        # Of commands that wait at the page, only the newest is sent.
+        with table.attack(what, "not obeyed", reason, number // 2, "robot"):
             for _ in range(number):
                 await ours.drive(0.5, late_ms=1000 * late_s)
                 await asyncio.sleep(0.01)
@@ -387,7 +387,7 @@ async def test_a_message_that_is_too_big_ends_its_connection_and_no_other(
             assert resident_kb(page.pid) < before + 5_000
 
 
-async def test_a_frame_that_is_not_a_message_is_reported_once_a_second_and_a_flood_ends(
+async def test_a_frame_that_is_not_a_message_is_reported_and_a_flood_ends(
     table: Table, bus: Bus
 ) -> None:
     most = int(REQUEST_RATE.burst)
@@ -400,7 +400,7 @@ async def test_a_frame_that_is_not_a_message_is_reported_once_a_second_and_a_flo
                 while (message := await ours.socket.receive()).type == aiohttp.WSMsgType.TEXT:
                     frames.append(message.data)
             assert ours.socket.close_code == 1008
-            assert sum("refused" in entry for entry in frames) < 50  # limited by the send rate
+            assert 0 < sum("refused" in entry for entry in frames) <= most + 1
 
 
 async def test_a_thousand_connections_do_not_disconnect_the_page_that_drives(

@@ -112,7 +112,7 @@ async def test_a_client_that_must_disconnect_drives_no_more_even_if_it_does_not_
             await asyncio.sleep(0.01)
         await ours.say(ping=1)
         await asyncio.sleep(0.2)
-        inside.parts.commands.outbox.flush(PATIENCE_S)
+        inside.parts.outbox.flush(PATIENCE_S)
         assert inside.counts.all() == before
         wire.abort()
 
@@ -159,7 +159,7 @@ async def test_a_stamp_too_large_to_sign_is_refused_and_the_next_command_is_acce
         wish = {"linear_x": 0.2, "angular_z": 0.0}
         await ours.say(cmd=wish, stamp=MAX_INT64 / 1e6)
         refused = await ours.find(lambda frame: frame.get("refused") == "cmd")
-        assert "ms since 1970" in refused["reason"]
+        assert "stamp" in refused["reason"]
         await ours.drive(0.0)
         await eventually(lambda: inside.counts.all().get("commands_dropped"))
 
@@ -200,34 +200,12 @@ async def test_a_client_that_unsubscribes_and_disconnects_leaves_no_subscription
         async with inside.hands() as ours:
             await ours.say(subscribe="odom", rate=50)
             await ours.find(lambda frame: "key" in frame)
-            assert inside.robot.streams.followed("odom") is not None
+            assert "odom" in inside.robot.streams._streams
             # The server reads both messages at once.
             await ours.say(unsubscribe="odom")
             await ours.socket.close()
             await eventually(lambda: not inside.page._viewers)
-            assert inside.robot.streams.followed("odom") is None
-
-
-async def test_a_client_that_pings_without_reading_gets_one_answer_to_all_pings(
-    inside: Inside,
-) -> None:
-    async with inside.hands() as ours:
-        await ours.find(lambda frame: "hello" in frame)
-        wire = cast(Any, ours.socket)._response.connection.transport
-        wire.pause_reading()
-        (viewer,) = inside.page._viewers
-        viewer._out.enqueue({"more than a kernel holds": "x" * 3_000_000})
-        await eventually(lambda: unsent_bytes(viewer._out._transport) > MAX_UNREAD_BYTES)
-        for n in range(60):
-            await ours.socket.ping(b"%0125d" % n)
-        await ours.drive(0.0)
-        await eventually(lambda: inside.counts.all().get("commands_dropped"))
-        ours.socket._autoping = False  # the client would answer and hide what the test waits for
-        wire.resume_reading()
-        async with asyncio.timeout(PATIENCE_S):
-            while (message := await ours.socket.receive()).type != aiohttp.WSMsgType.PONG:
-                pass
-        assert message.data == b"%0125d" % 59
+            assert "odom" not in inside.robot.streams._streams
 
 
 async def test_a_key_comes_when_a_bus_that_was_gone_is_back(inside: Inside, tmp_path: Path) -> None:
@@ -243,24 +221,8 @@ async def test_a_key_comes_when_a_bus_that_was_gone_is_back(inside: Inside, tmp_
                 await ours.state(lambda state: state["mode"])
 
 
-async def test_a_robot_with_a_closed_session_is_reported_as_gone_and_the_server_goes_on(
-    inside: Inside, tmp_path: Path
-) -> None:
-    with Daemon(tmp_path) as daemon:
-        closed = client_session(daemon.endpoint, "")
-        closed.close()
-        way = Connection(closed, "acsar", "teleop")
-        robot = FollowedRobot(
-            Address(daemon.endpoint, "acsar", ""), lambda: way, ABOUT, inside.counts
-        )
-        running = asyncio.create_task(robot.run())
-        await eventually(lambda: "again" in robot.gone or running.done())
-        assert not running.done()
-        running.cancel()
-
-
 async def test_a_failed_command_outbox_ends_the_server(inside: Inside) -> None:
-    outbox = inside.parts.commands.outbox
+    outbox = inside.parts.outbox
     outbox.dead.set_exception(MemoryError("no room"))
     with pytest.raises(MemoryError):
         await first_ended([asyncio.sleep(60)], outbox)

@@ -120,7 +120,7 @@ async def test_a_token_becomes_a_cookie_that_no_script_reads_and_ends_when_revok
         for word in ("__Host-acsard-", "HttpOnly", "Secure", "SameSite=Strict", "Path=/"):
             assert word in cookie
         async with session.get(f"{page.away}/api/whoami") as answer:
-            assert await answer.json() == {"role": "operator", "name": "lent", "full": ""}
+            assert await answer.json() == {"role": "operator", "name": "lent"}
         async with session.ws_connect(f"{page.away}/ws") as ours:
             page.tokens("revoke", "lent")
             async with asyncio.timeout(PATIENCE_S):
@@ -242,12 +242,12 @@ async def test_a_token_has_few_connections_and_still_stops_beyond_them(
             await session.ws_connect(f"{page.away}/ws")
         assert caught.value.status == 503
         async with session.get(f"{page.away}/api/whoami") as answer:
-            assert "close some" in (await answer.json())["full"]
+            assert "close some" in (await answer.json())["error"]
         async with session.post(f"{page.away}/api/srv/stop") as answer:
             assert (await answer.json())["success"]
         theirs = await stack.enter_async_context(hands(page, phone))
         assert (await theirs.call("stop"))["ok"]
-    assert page.refused()["too_many"] == counted + 1
+    assert page.refused()["too_many"] == counted + 2
 
 
 def test_bytes_that_are_not_a_request_get_a_json_error(page: Page, bus: Bus) -> None:

@@ -28,11 +28,12 @@ export async function invited(waiting) {
   }
 }
 
-/** Return why a WebSocket is refused, as {why, barred}, because no browser reports this. `barred` means that the robot
- *  refuses everything from this browser, also STOP, so a repeated attempt is pointless. */
+/** Return why a WebSocket is refused, as {why, barred}, because no browser reports this: another request is refused for
+ *  the same reason. `barred` means that the robot refuses everything from this browser, also STOP, so a repeated attempt
+ *  is pointless. */
 export async function refusal() {
-  const { status, error, body } = await request("api/whoami", {}, 2000);
-  return { why: error || body.full, barred: BARRED.includes(status) };
+  const { status, error } = await request("api/whoami", {}, 2000);
+  return { why: error, barred: BARRED.includes(status) };
 }
 
 /** Return the answer to an HTTP request as {status, body, error}. `error` is "" if it succeeded, and `status` is 0 if

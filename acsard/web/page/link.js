@@ -116,7 +116,7 @@ export class Link {
     } else if ("answer" in message) this.#answer(message);
     else if (message.key === "beat") this.beat = message.value;
     else if ("key" in message) this.#takers[message.key]?.(message);
-    else for (const kind of ["hello", "path", "minute", "refused", "gone"]) if (kind in message) this.#takers[kind](message);
+    else for (const kind of ["hello", "path", "refused", "gone"]) if (kind in message) this.#takers[kind](message);
   }
 
   #answer(message) {

@@ -52,7 +52,6 @@ const link = new Link(refused, {
   diagnostics: ({ value }) => views.parts($("parts"), value),
   events: ({ value }) => views.happened($("happened"), value),
   path: ({ path }) => map.trail(path),
-  minute: ({ minute }) => plots.begin(performance.now(), minute),
   refused: ({ reason }) => hint(reason),
   gone: ({ gone }) => (silent = gone),
   up: connected,

@@ -1,6 +1,5 @@
 // The plots of the last minute: lines over time, the scale at the left, the present at the right, and below each plot
-// a legend with the present values. The plots begin with the data that the page's server has kept, and shade the time
-// before it.
+// a legend with the present values. They shade the time before the first value.
 
 import { colours, sized } from "./map.js";
 import { $, made } from "./views.js";
@@ -26,16 +25,6 @@ export class Minute {
     this.wheels = plot("wheels", WHEELS, { low: -1, high: 3 });
     this.late = plot("late", LATE, { low: 0, high: 1 });
     this.volts = plot("volts", VOLTS, { span: 1 });
-  }
-
-  /** Add the data `kept` of the page's server: one column per line, and the column `age` with the age at `now`, ms. */
-  begin(now, kept) {
-    const times = kept.age.map((age) => now - age);
-    this.speed.begin(times, kept.linear, kept.wished_linear);
-    this.turn.begin(times, kept.angular, kept.wished_angular);
-    this.wheels.begin(times, ...kept.wheels);
-    this.late.begin(times, kept.late_p99, kept.late_max);
-    this.volts.begin(times, kept.volts);
   }
 
   draw(now) {
@@ -80,19 +69,6 @@ class Plot {
       const { points } = this.#lines[n];
       points.push([now, value]);
       while (points.length && points[0][0] < now - SPAN) points.shift();
-    });
-  }
-
-  /** Insert earlier values, which replace the points of the same time span. `times` are in ms. There is a column for
-   *  each line, with null where a value is unknown. */
-  begin(times, ...columns) {
-    if (!times.length) return;
-    columns.forEach((column, n) => {
-      const line = this.#lines[n];
-      const before = line.points.filter(([at]) => at < times[0]);
-      const after = line.points.filter(([at]) => at > times.at(-1));
-      const known = times.map((at, row) => [at, column[row]]).filter(([, value]) => value !== null);
-      line.points = [...before, ...known, ...after];
     });
   }
 

@@ -1,6 +1,6 @@
 """Tests of how the server delivers the page's files.
 
-It accepts plain file names only, compresses files if this helps, and reloads changed files.
+It accepts plain file names only, and compresses files if this helps.
 """
 
 from __future__ import annotations
@@ -9,7 +9,6 @@ import asyncio
 import base64
 import gzip
 import hashlib
-import os
 import re
 import ssl
 from contextlib import suppress
@@ -22,9 +21,9 @@ from acsard.machine.authority import Authority
 from acsard.web.answers import (
     INLINED,
     PAGE_DIRECTORY,
-    Files,
     cut,
     file_answer,
+    page_files,
 )
 
 
@@ -46,7 +45,7 @@ def page(tmp_path: Path) -> Path:
 
 
 def test_a_file_is_sent_compressed_and_with_its_type(page: Path) -> None:
-    file = Files(page).get("index.html")
+    file = page_files(page).get("index.html")
     assert file is not None
     assert file.kind == "text/html; charset=utf-8"
     assert file.packed is not None
@@ -55,7 +54,7 @@ def test_a_file_is_sent_compressed_and_with_its_type(page: Path) -> None:
 
 
 def test_a_small_file_is_not_compressed(page: Path) -> None:
-    file = Files(page).get("small.js")
+    file = page_files(page).get("small.js")
     assert file is not None
     assert file.packed is None
 
@@ -68,27 +67,11 @@ def test_a_small_file_is_not_compressed(page: Path) -> None:
     ],
 )  # fmt: skip
 def test_any_other_path_is_not_found(page: Path, name: str) -> None:
-    assert Files(page).get(name) is None
-
-
-def test_a_changed_file_is_read_again(page: Path) -> None:
-    files = Files(page)
-    before = files.get("small.js")
-    (page / "small.js").write_text("2")
-    os.utime(page / "small.js", ns=(1, 1))
-    files.read()
-    after = files.get("small.js")
-    assert before is not None
-    assert after is not None
-    assert (after.body, after.tag != before.tag) == (b"2", True)
-
-
-def test_without_a_directory_no_file_is_found(tmp_path: Path) -> None:
-    assert Files(tmp_path / "none").get("index.html") is None
+    assert page_files(page).get(name) is None
 
 
 def test_the_page_has_stop_and_its_style_in_itself_and_allows_them_by_their_hashes() -> None:
-    page = Files().get("index.html")
+    page = page_files().get("index.html")
     assert page is not None
     sources = {
         "script-src": re.findall(rb"<script>(.*?)</script>", page.body, re.DOTALL),
@@ -109,7 +92,7 @@ def test_a_page_that_the_browser_has_already_keeps_its_policy() -> None:
 
     The answer must therefore contain the content security policy again.
     """
-    page = Files().get("index.html")
+    page = page_files().get("index.html")
     assert page is not None
     first = file_answer(make_mocked_request("GET", "/"), page)
     again = file_answer(make_mocked_request("GET", "/", {"If-None-Match": page.tag}), page)
@@ -120,27 +103,11 @@ def test_a_page_that_the_browser_has_already_keeps_its_policy() -> None:
 
 
 def test_any_other_file_allows_no_inline_script() -> None:
-    file = Files().get("main.js")
+    file = page_files().get("main.js")
     assert file is not None
     answer = file_answer(make_mocked_request("GET", "/page/main.js"), file)
     assert "script-src" not in answer.headers["Content-Security-Policy"]
     assert "default-src 'self'" in answer.headers["Content-Security-Policy"]
-
-
-def test_a_page_whose_stop_script_changed_is_read_again(page: Path) -> None:
-    files = Files(page)
-    before = files.get("index.html")
-    (page / "stop.js").write_text("stop(2)")
-    files.read()
-    after = files.get("index.html")
-    assert before is not None
-    assert after is not None
-    assert before.policy != after.policy
-
-
-def test_a_page_without_its_stop_is_not_sent(page: Path) -> None:
-    (page / "stop.js").unlink()
-    assert Files(page).get("index.html") is None
 
 
 @pytest.mark.parametrize("secure", [True, False])

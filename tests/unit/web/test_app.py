@@ -20,7 +20,6 @@ from acsard.core.config.settings import Config, WebConfig
 from acsard.core.messages.schema import ServiceReply
 from acsard.core.values import NS_PER_S, Role
 from acsard.host import clock
-from acsard.web import app
 from acsard.web.access import IDENTITY_KEY
 from acsard.web.app import Page, settings_in
 from acsard.web.callers import RequestRefusedError
@@ -54,19 +53,14 @@ async def test_the_age_of_a_picture_counts_a_suspend(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The age must include the suspend, in which the monotonic clock stands still."""
-    headers, page = dict[str, str](), page_of(tmp_path)
+    page = page_of(tmp_path)
     page._camera = Camera("http://127.0.0.1:1/")
-
-    async def sent(request: web.Request, body: bytes, fields: dict[str, str], *_: object) -> None:
-        headers.update(fields)
-
-    monkeypatch.setattr(app, "sent_in_pieces", sent)
     page._camera._take(b"picture")
     slept_ns = clock.asleep_ns() + 3600 * NS_PER_S
     monkeypatch.setattr(clock, "asleep_ns", lambda: slept_ns)
     request = make_mocked_request("GET", "/api/camera")
     request[IDENTITY_KEY] = MAINTAINER
-    await page.picture(request)
+    headers = (await page.picture(request)).headers
     page._camera.close()
     assert int(headers["Age-Ms"]) >= 3_600_000
     assert int(headers["Waited-Ms"]) < 60_000

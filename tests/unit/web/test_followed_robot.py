@@ -6,13 +6,11 @@ It uses the published states and the answers to queries.
 from __future__ import annotations
 
 import asyncio
-import itertools
 from collections.abc import Callable
-from typing import Any
+from typing import Any, cast
 
 import msgspec
 import pytest
-import zenoh
 from msgspec.structs import replace
 
 from acsard.bus.address import Address
@@ -25,8 +23,7 @@ from acsard.client.follower import (
 from acsard.core.config.settings import Config
 from acsard.core.messages.schema import Time
 from acsard.core.values import NS_PER_S
-from acsard.host import clock
-from acsard.host.threads import NoThreadError
+from acsard.host.errors import NoAnswerError, UnreachableError
 from acsard.web import followed_robot
 from acsard.web.followed_robot import (
     PATH_POINTS,
@@ -34,10 +31,8 @@ from acsard.web.followed_robot import (
     About,
     FollowedRobot,
     PathHistory,
-    _TaskQueries,
 )
 from acsard.web.metrics import Counts
-from tests.each import each
 from tests.unit.client.test_follower import UNREADABLE, Robot
 from tests.unit.top.screens import INFO, STATE, sample_of
 
@@ -45,20 +40,11 @@ ABOUT = About("1", False, 1.0, 4.0, 10.0, "", {"teleop": 0.25, "app": 0.25})
 
 
 class World:
-    """A page's robot in virtual time, which advances each time the page checks the robot."""
+    """A page's robot in virtual time, which advances each time the page looks at the robot."""
 
-    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        self.now, self.asleep = 100.0, 0.0
+    def __init__(self) -> None:
+        self.now, self.asked = 100.0, 0
         self.answers: Callable[[], Any] = lambda: None
-        self.asked = 0
-        monkeypatch.setattr(clock, "mono_ns", lambda: round((self.now - self.asleep) * NS_PER_S))
-        monkeypatch.setattr(clock, "asleep_ns", lambda: round(self.asleep * NS_PER_S))
-        monkeypatch.setattr(followed_robot, "PROCESS_PERIOD_S", 0.0)
-
-        async def at_once(call: Callable[[], Any], timeout: float | None) -> Any:
-            return call()
-
-        monkeypatch.setattr(followed_robot, "in_thread", at_once)
         never: Any = None
         self.followed = FollowedRobot(Address("tcp/x:1", "acsar", ""), never, ABOUT, Counts())
         self.robot = Answering(self)
@@ -74,25 +60,16 @@ class World:
         `publishes` returns the sample that the robot publishes at a time, or None.
         """
         changes: list[tuple[float, str]] = []
-
-        async def story() -> None:
-            client: Any = self.robot
-            watch = Watch(_TaskQueries(client), self.now)
-            watching = asyncio.create_task(self.followed._follow(watch))
-            began, before = self.now, self.followed.gone
-            while self.now - began < seconds:
-                if (sample := publishes(self.now - began)) is not None:
-                    self.robot.queue.append(sample)
-                for _ in range(5):  # each task of the page has its turn
-                    await asyncio.sleep(0)
-                if self.followed.gone != before:
-                    before = self.followed.gone
-                    changes.append((self.now - began, before))
-                self.now += PROCESS_PERIOD_S
-            assert not watching.done()
-            watching.cancel()
-
-        asyncio.run(story())
+        watch = Watch(cast(Any, self.robot), self.now)
+        began, before = self.now, self.followed.gone
+        while self.now - began < seconds:
+            if (sample := publishes(self.now - began)) is not None:
+                self.robot.queue.append(sample)
+            self.followed._look(watch, self.now)
+            if self.followed.gone != before:
+                before = self.followed.gone
+                changes.append((self.now - began, before))
+            self.now += PROCESS_PERIOD_S
         return changes
 
 
@@ -110,8 +87,8 @@ class Answering(Robot):
 
 
 @pytest.fixture
-def world(monkeypatch: pytest.MonkeyPatch) -> World:
-    return World(monkeypatch)
+def world() -> World:
+    return World()
 
 
 def test_a_robot_that_falls_silent_is_reported_within_its_time(world: World) -> None:
@@ -149,87 +126,40 @@ def test_a_robot_that_returns_is_present_without_delay(world: World) -> None:
     assert changes[-1][0] <= 6.0 + 2 * PROCESS_PERIOD_S
 
 
-def test_a_robot_whose_last_state_is_older_than_a_suspend_is_silent_immediately(
-    world: World,
-) -> None:
-    def publishes(t: float) -> Any:
-        if t < 5.0:
-            return world.state()
-        if not world.asleep:
-            world.asleep = 60.0
-            world.now += 60.0
-        return None
-
-    (_, here), (at, reason) = world.reachability_changes(70.0, publishes)
-    assert here == ""
-    assert "nothing is received" in reason
-    assert 65.0 <= at <= 65.0 + 2 * PROCESS_PERIOD_S
-
-
 class AnsweringRobot(Robot):
     """A client whose robot also answers with its version and its configuration."""
 
+    def __init__(self, failures: int) -> None:
+        super().__init__()
+        self._failures = failures
+
     def get(self, name: str) -> Any:
+        if self._failures:
+            self._failures -= 1
+            raise NoAnswerError("no answer")
         return INFO if name == "info" else msgspec.to_builtins(Config())
 
 
-@each(
-    ("error", "reason"),
-    [
-        (
-            NoThreadError("this process cannot start another thread (no memory)"),
-            "this process cannot start another thread (no memory); the page tries again by itself",
-        ),
-        (TimeoutError(), "the Zenoh bus is stuck; the page tries again by itself"),
-        (zenoh.ZError("closed"), "the Zenoh bus is stuck; the page tries again by itself"),
-    ],
-)
-async def test_the_page_says_why_it_cannot_follow_the_robot_yet(
-    error: Exception, reason: str, monkeypatch: pytest.MonkeyPatch
+async def test_the_page_learns_about_its_robot_although_it_was_not_there_at_first(
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    errors = iter([error])
+    for name in ("RETRY_DELAY_S", "ABOUT_RETRY_S", "PROCESS_PERIOD_S"):
+        monkeypatch.setattr(followed_robot, name, 0.001)
+    client, attempts = AnsweringRobot(failures=2), iter([UnreachableError("nobody is there")])
+    client.queue.append(sample_of(STATE))
 
-    async def in_thread(call: Callable[[], Any], timeout: float | None, *_: object) -> Any:
-        # Of the threads at the start, only that of the subscription has a time limit.
-        if timeout is not None and (failure := next(errors, None)):
-            raise failure
-        return call()
+    def connect() -> Any:
+        for error in attempts:
+            raise error
+        return client
 
-    monkeypatch.setattr(followed_robot, "in_thread", in_thread)
-    client: Any = AnsweringRobot()
-    page = FollowedRobot(Address("tcp/x:1", "acsar", ""), lambda: client, ABOUT, Counts())
+    page = FollowedRobot(Address("tcp/x:1", "acsar", ""), connect, ABOUT, Counts())
     running = asyncio.create_task(page.run())
-    for _ in range(10):
-        await asyncio.sleep(0)
-    assert page.gone == reason
-    running.cancel()
-
-
-@each("failing", [0, 1, 2, 3])
-async def test_the_page_learns_about_its_robot_although_a_thread_could_not_start_once(
-    failing: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Threads connect, subscribe to `state`, and query `info` and `config`.
-
-    In each run of the test one of these threads fails to start once.
-    """
-    starts = itertools.count()
-
-    async def in_thread(call: Callable[[], Any], *_: object) -> Any:
-        if next(starts) == failing:
-            raise NoThreadError("this process cannot start another thread")
-        return call()
-
-    monkeypatch.setattr(followed_robot, "in_thread", in_thread)
-    monkeypatch.setattr(followed_robot, "RETRY_DELAY_S", 0.0)
-    monkeypatch.setattr(followed_robot, "ABOUT_RETRY_S", 0.0)
-    client: Any = AnsweringRobot()
-    page = FollowedRobot(Address("tcp/x:1", "acsar", ""), lambda: client, ABOUT, Counts())
-    running = asyncio.create_task(page.run())
-    for _ in range(100):
-        await asyncio.sleep(0)
+    async with asyncio.timeout(5.0):
+        while page.about.version != INFO.version:
+            await asyncio.sleep(0.001)
     assert not running.done()
-    assert page.about.version == INFO.version
+    assert page.gone == ""
     running.cancel()
 
 

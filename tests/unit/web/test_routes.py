@@ -22,8 +22,8 @@ def test_only_the_page_s_own_files_and_the_token_are_open_to_strangers() -> None
     assert is_open == {"/", "/favicon.ico", "/page/{name}", "/token"}
 
 
-def test_only_a_stop_and_the_reason_for_a_refusal_are_served_beyond_the_limits_of_a_token() -> None:
-    assert {row.path for row in ROUTES if row.always} == {"/api/srv/stop", "/api/whoami"}
+def test_only_a_stop_is_served_beyond_the_limits_of_a_token() -> None:
+    assert {row.path for row in ROUTES if row.always} == {"/api/srv/stop"}
 
 
 def test_each_service_has_the_role_that_the_bus_asks_for() -> None:

@@ -1,4 +1,4 @@
-"""The page's server reads tokens, files and certificates again each second, in one thread.
+"""The page's server reads tokens and certificates again each second, in one thread.
 
 A disk that hangs delays none of its requests.
 """
@@ -21,7 +21,6 @@ from acsard.core.config.settings import LogConfig
 from acsard.host.logs import Log
 from acsard.machine.authority import Authority
 from acsard.web import server
-from acsard.web.answers import Files
 from acsard.web.metrics import Counts
 from acsard.web.server import Certificate
 from acsard.web.tokens import ReadTokens, Vault
@@ -38,9 +37,8 @@ async def test_one_thread_waits_for_a_hanging_disk_and_then_everything_is_read_a
     log, vault = Log(LogConfig(), io.StringIO()), Vault(tmp_path / "state", "acsar")
     text, _ = vault.invite("viewer", "tv", 1)
     tokens, certificate = ReadTokens(vault), Certificate(str(tmp_path), log)
-    page: Any = SimpleNamespace(files=Files(tmp_path))
     before = certificate.context
-    reading = asyncio.create_task(server._read_disk(tokens, page, certificate))
+    reading = asyncio.create_task(server._read_disk(tokens, certificate))
     try:
         await tokens.next_reading()
         assert tokens.owner([text]) is not None

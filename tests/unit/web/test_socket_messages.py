@@ -52,7 +52,7 @@ def test_a_stamp_keeps_its_tenth_of_a_ms_in_ns() -> None:
 
 @each("stamp", [9.3e12, 1.8e13, 2.0**51, MAX_STAMP_MS])
 def test_a_stamp_that_no_signature_holds_is_refused(stamp: float) -> None:
-    with pytest.raises(FrameError, match="ms since 1970"):
+    with pytest.raises(FrameError, match="stamp"):
         decode(json.dumps(COMMAND | {"stamp": stamp}))
 
 

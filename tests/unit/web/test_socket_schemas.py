@@ -13,7 +13,6 @@ from acsard.core.messages.encodings import encode
 from acsard.core.messages.report import Report
 from acsard.core.values import Role
 from acsard.web import socket_messages
-from acsard.web.last_minute import Minute
 from acsard.web.openapi import KEYS, SENT_MESSAGES, VALUE_PREFIX
 from acsard.web.socket_sender import Following
 from acsard.web.streams import VIEWER_KEYS as FOLLOWED
@@ -29,8 +28,7 @@ GREETING = socket_messages.Greeting(
 
 SAID: tuple[Struct, ...] = (
     socket_messages.Hello(GREETING),
-    socket_messages.DrivenPath([(0.0, 1.5)], []),
-    socket_messages.LastMinute(Minute().plotted(0)),
+    socket_messages.DrivenPath([(0.0, 1.5)]),
     socket_messages.Answer(7, True, "stopped"),
     socket_messages.Pong(12.5, 1e12),
     socket_messages.Refused("cmd", "why"),

@@ -8,7 +8,6 @@ from types import SimpleNamespace
 from typing import Any, cast
 
 import msgspec
-import pytest
 from aiohttp import web
 from aiohttp.test_utils import make_mocked_request
 
@@ -28,19 +27,6 @@ async def test_earlier_messages_do_not_delay_a_key_that_is_due_soon() -> None:
     woken = [await out._send_due(subscription, now) for now in (100.04, 100.07, 100.099)]
     assert woken == [due] * 3
     assert await out._send_due(subscription, due) > due
-
-
-@pytest.mark.slow
-async def test_a_refusal_is_reported_once_a_second_for_each_kind_of_message_and_reason() -> None:
-    counts = Counts()
-    out = Outgoing(web.WebSocketResponse(), REQUEST, STREAMS, counts, "")
-    for _ in range(3):
-        out.refuse("subscribe", "malformed", "no such key")
-        out.refuse("cmd", "malformed", "not a number")
-        out.refuse("cmd", "role", "for operators")
-    messages = [msgspec.json.decode(message) for message in out._out]
-    assert [message["refused"] for message in messages] == ["subscribe", "cmd", "cmd"]
-    assert counts.refused() == {"malformed": 6, "role": 3}
 
 
 class Socket:
