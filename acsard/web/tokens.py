@@ -138,7 +138,7 @@ class Vault:
 
     @contextmanager
     def _changing(self) -> Iterator[list[dict[str, Any]]]:
-        """Lock the file, delete the expired tokens, and write the file after the `with` block."""
+        # Locks the file, deletes the expired tokens, and writes the file after the `with` block.
         directory = self.path.parent
         try:
             directory.mkdir(mode=0o700, parents=True, exist_ok=True)
