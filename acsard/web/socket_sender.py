@@ -17,6 +17,8 @@ import msgspec
 from aiohttp import web
 
 from acsard.core.messages.keys_and_roles import BEAT
+from acsard.host import clock
+from acsard.host.rate_limits import Buckets, Rate
 from acsard.web.answers import cut, unsent_bytes
 from acsard.web.callers import Reason
 from acsard.web.metrics import Counts
@@ -29,6 +31,11 @@ MAX_UNREAD_BYTES = 32768
 
 # Sum of all keys of a WebSocket. More would take processor time from the commands.
 MAX_FRAMES_HZ = 300.0
+
+
+# Of reports about refused messages, for each kind of message and each reason: a client that sends
+# many and reads none would not read why its connection ends.
+REPORT_RATE = Rate(1.0)
 
 
 class Following:
@@ -63,6 +70,7 @@ class Outgoing:
         # The queue is limited, because the client may have stopped reading.
         self._out: deque[tuple[bytes, aiohttp.WSMsgType]] = deque(maxlen=200)
         self._news, self._loop = asyncio.Event(), asyncio.get_running_loop()
+        self._reports = Buckets(REPORT_RATE)
         self._closing = False
 
     def enqueue(self, message: object) -> None:
@@ -82,9 +90,10 @@ class Outgoing:
             self._loop.call_soon_threadsafe(self._news.set)
 
     def refuse(self, what: str, reason: Reason, text: str) -> None:
-        """Count a refused message, and report it to the client."""
+        """Count a refused message, and report it to the client within `REPORT_RATE`."""
         self._counts.refuse(reason, self._origin)
-        self.enqueue(Refused(what, text))
+        if self._reports.take(f"{what} {reason}", clock.mono_ns()):
+            self.enqueue(Refused(what, text))
 
     def subscribe(self, key: str, rate: float) -> None:
         """Subscribe to a key or change its rate, or report to the client why not."""

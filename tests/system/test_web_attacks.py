@@ -387,7 +387,7 @@ async def test_a_message_that_is_too_big_ends_its_connection_and_no_other(
             assert resident_kb(page.pid) < before + 5_000
 
 
-async def test_a_frame_that_is_not_a_message_is_reported_and_a_flood_ends(
+async def test_a_frame_that_is_not_a_message_is_reported_once_a_second_and_a_flood_ends(
     table: Table, bus: Bus
 ) -> None:
     most = int(REQUEST_RATE.burst)
@@ -400,7 +400,9 @@ async def test_a_frame_that_is_not_a_message_is_reported_and_a_flood_ends(
                 while (message := await ours.socket.receive()).type == aiohttp.WSMsgType.TEXT:
                     frames.append(message.data)
             assert ours.socket.close_code == 1008
-            assert 0 < sum("refused" in entry for entry in frames) <= most + 1
+            assert (
+                0 < sum("refused" in entry for entry in frames) < most // 2
+            )  # limited by the rate
 
 
 async def test_a_thousand_connections_do_not_disconnect_the_page_that_drives(

@@ -359,9 +359,8 @@ def test_the_log_of_a_refusal_names_the_address_and_the_token_s_name(
             async with program.get(f"{page.away}/api/config") as answer:
                 assert answer.status == 403
         async with hands(page, operator) as ours:
-            for _ in range(2):
-                await ours.say(cmd={"linear_x": 0.1, "angular_z": 0}, stamp=1763700000000.0)
-            await ours.find(lambda frame: frame.get("reason", "").startswith("`stamp` must"))
+            await ours.say(cmd={"linear_x": 0.1, "angular_z": 0}, stamp=0)
+            await ours.find(lambda frame: "stamp" in frame.get("reason", ""))
 
     run(story)
     until(lambda: told("from 127.0.0.1 (tv)") and told("from 127.0.0.1 (phone)"), 10.0, "named")
