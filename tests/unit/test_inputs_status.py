@@ -1,7 +1,4 @@
-"""Tests of the board's status lines: accepted forms, refused forms, and damage.
-
-No damage may make a pressed emergency stop look released.
-"""
+"""The board's status lines. No damage may make a pressed emergency stop look released."""
 
 from __future__ import annotations
 
@@ -36,13 +33,15 @@ def sealed(line: bytes) -> bytes:
     return line + b"*%04X" % binascii.crc_hqx(line, 0)
 
 
-# forms
+def why(line: bytes, check: bool) -> str:
+    with pytest.raises(FrameError) as caught:
+        decode_status(line, check)
+    return caught.value.reason
 
 
 @each("check", [False, True])
 def test_each_field_is_read(check: bool) -> None:
-    line = sealed(FULL) if check else FULL
-    assert decode_status(line, check) == BoardStatus(
+    assert decode_status(sealed(FULL) if check else FULL, check) == BoardStatus(
         estop=False, bumpers=(False, False, True, False), driver_fault=True, volts=24.31,
         amps=-1.2, charge=0.87, temperature=-4.5,
     )  # fmt: skip
@@ -82,29 +81,18 @@ def test_each_field_is_optional_and_the_order_is_free(fields: bytes, status: Boa
     ],
 )  # fmt: skip
 def test_a_status_line_of_any_other_form_is_refused_whole(line: bytes) -> None:
-    with pytest.raises(FrameError) as caught:
-        decode_status(line, False)
-    assert caught.value.reason == "status_malformed"
+    assert why(line, False) == "status_malformed"
 
 
 def test_a_checksum_must_be_right_and_a_checked_link_requires_it() -> None:
     assert sealed(OK) == b"!status estop=ok*9C94"
     assert decode_status(sealed(OK), True) == decode_status(OK, False)
-    with pytest.raises(FrameError) as caught:
-        decode_status(OK, True)
-    assert caught.value.reason == "status_without_crc"
+    assert why(OK, True) == "status_without_crc"
     for check in (False, True):
-        with pytest.raises(FrameError) as caught:
-            decode_status(b"!status estop=ok*9C95", check)
-        assert caught.value.reason == "status_crc_error"
-
-
-@each("check", [False, True])
-@each("word", ["ok", "pressed"])
-def test_the_simulated_board_writes_the_same_line(word: str, check: bool) -> None:
-    line = protocol.status({"estop": word}, check)
-    assert line == (sealed(b"!status estop=" + word.encode()) if check else
-                    b"!status estop=" + word.encode()) + b"\r\n"  # fmt: skip
+        assert why(b"!status estop=ok*9C95", check) == "status_crc_error"
+        for line in (OK, PRESSED):
+            word = {"estop": line.partition(b"=")[2].decode()}
+            assert protocol.status(word, check) == (sealed(line) if check else line) + b"\r\n"
 
 
 def test_a_field_keeps_its_last_value_until_a_newer_line_has_it() -> None:
@@ -133,13 +121,11 @@ def test_a_status_line_is_not_a_reply_in_any_dialect(line: bytes) -> None:
 
 @each("reply", REPLIES)
 def test_no_reply_with_two_wrong_bits_or_a_cut_is_a_status_line(reply: bytes) -> None:
-    whole = int.from_bytes(reply, "big")
-    bits = 8 * len(reply)
-    for bit in range(bits):
-        for other in range(bit):
-            damaged = (whole ^ 1 << bit ^ 1 << other).to_bytes(len(reply), "big")
-            assert not damaged.startswith(STATUS)
-    assert not any(reply[cut:].startswith(STATUS) for cut in range(len(reply)))
+    # At most two bits differ, so at most two bytes of the word.
+    for cut in range(len(reply)):
+        start = reply[cut : cut + len(STATUS)]
+        wrong = sum((a ^ b).bit_count() for a, b in zip(start, STATUS, strict=False))
+        assert len(start) < len(STATUS) or wrong > 2
 
 
 # damage
@@ -174,48 +160,28 @@ def damaged(line: bytes, others: tuple[bytes, ...], dice: random.Random) -> byte
     return bytes(data)
 
 
-def wrongly_taken(count: int, check: bool) -> Counter[str]:
-    """Damage `count` lines, and count the accepted lines with a wrong emergency stop."""
+COUNTS = [4000, pytest.param(1_000_000, marks=[pytest.mark.soak, pytest.mark.timeout(600)])]
+
+
+@each("check", [False, True])
+@pytest.mark.parametrize("count", COUNTS)
+def test_damage_never_changes_the_emergency_stop(count: int, check: bool) -> None:
     dice, tally = random.Random(33), Counter[str]()
-    extra = (b"", b" volts=24.31", b" bumpers=..X. volts=24.31 charge=87%")
     for _ in range(count):
-        pressed = dice.random() < 0.5
         # A line with another emergency stop would be true, because it is the later one.
-        word = PRESSED if pressed else OK
-        line = word + dice.choice(extra)
-        others = (word, *REPLIES)
-        frame = damaged(sealed(line) if check else line, others, dice)
-        if not frame.startswith(STATUS):
-            continue
-        try:
-            status = decode_status.__wrapped__(frame, check)
-        except FrameError:
-            continue
-        if status.estop is not None:
-            right = (
-                "right" if status.estop is pressed else "pressed" if status.estop else "released"
-            )
-            tally[right] += 1
-    return tally
+        word = dice.choice((PRESSED, OK))
+        line = word + dice.choice((b"", b" volts=24.31", b" bumpers=..X. volts=24.31 charge=87%"))
+        frame = damaged(sealed(line) if check else line, (word, *REPLIES), dice)
+        if frame.startswith(STATUS):
+            with suppress(FrameError):
+                read = decode_status.__wrapped__(frame, check).estop
+                tally["right" if read in (None, word == PRESSED) else "wrong"] += 1
+    assert check or tally["right"] > count / 100
+    assert tally["wrong"] == 0
 
 
 @each("check", [False, True])
-@pytest.mark.parametrize(
-    "count",
-    [20_000, pytest.param(1_000_000, marks=[pytest.mark.soak, pytest.mark.timeout(600)])],
-)
-def test_damage_never_changes_the_emergency_stop_state(count: int, check: bool) -> None:
-    tally = wrongly_taken(count, check)
-    print(f"\n{count} damaged status lines, checked {check}: {dict(tally)}")
-    assert tally["released"] == 0
-    assert tally["pressed"] == 0
-
-
-@each("check", [False, True])
-@pytest.mark.parametrize(
-    "count",
-    [20_000, pytest.param(1_000_000, marks=[pytest.mark.soak, pytest.mark.timeout(600)])],
-)
+@pytest.mark.parametrize("count", COUNTS)
 @pytest.mark.parametrize("places", [("front", "rear", "left", "right"), ()])
 def test_damage_never_changes_the_state_of_a_bumper(
     places: tuple[Place, ...], count: int, check: bool
@@ -246,13 +212,10 @@ def test_damage_never_changes_the_state_of_a_bumper(
 
 
 def test_a_false_press_needs_half_a_second_of_damage() -> None:
-    """The damage destroys about half of the status lines.
-
-    The daemon assumes a pressed emergency stop only after five lost status lines in a row.
-    """
+    """The damage destroys about half of the status lines, of which ten come in a second."""
     dice, estop = random.Random(5), EmergencyStop()
     step_ns, presses, runs, last_ns = NS_PER_S // 100, 0, 0, 0
-    for step in range(200_000):
+    for step in range(40_000):
         now_ns, reports = step * step_ns, []
         if step % 10 == 0 and (step == 0 or dice.random() < 0.5):
             reports = [(now_ns, decode_status(OK, False))]
@@ -261,4 +224,4 @@ def test_a_false_press_needs_half_a_second_of_damage() -> None:
         presses += bool(estop.pressed_now)
         runs += now_ns - last_ns == int(SILENCE_TIMEOUT_S * NS_PER_S) + step_ns
     assert presses == runs
-    assert 100 < presses < 1000
+    assert 20 < presses < 200

@@ -1,6 +1,6 @@
 """Random networks between a sender and the daemon, in which the true age of each command is known.
 
-`python -m tests.unit.core.motion.networks 10000` plays so many, and prints what it measured.
+`python -m tests.unit.networks 10000` plays so many, and prints what it measured.
 """
 
 from __future__ import annotations

@@ -1,0 +1,292 @@
+"""How a robot drives: by a fresh command of an armed sender, along its ramps, line by line."""
+
+from __future__ import annotations
+
+import pytest
+
+from acsard.core.config.settings import CommandsConfig, Config, ControlConfig, LimitsConfig, Source
+from acsard.core.values import (
+    REST,
+    STILL,
+    Command,
+    Plain,
+    Pose,
+    Refusal,
+    Request,
+    Twist,
+    WheelSpeeds,
+)
+from tests.each import each
+from tests.unit.rig import GO, MS, ROLLING, ZERO_LINE, Rig
+
+
+def near(*values: float) -> object:
+    return pytest.approx(list(values), abs=1e-12)
+
+
+def test_after_a_zero_a_command_drives_and_not_before() -> None:
+    rig = Rig().linked()
+    assert {out.applied for out in rig.each(100, GO)} == {REST}
+    assert (rig.mode, rig.out.code, rig.out.source) == ("ready", "neutral", "app")
+    rig.step(REST, tick=False)
+    out = rig.step(GO, tick=False)
+    assert (out.mode, out.code, out.source, out.command_ns) == (
+        "driving", "commanded", "app", rig.now_ns,
+    )  # fmt: skip
+    # A step without a tick uses commands and feedback, and sends no line.
+    assert (out.line, out.due, len(out.estimates)) == (None, False, 1)
+
+
+def test_the_line_has_the_wheel_speeds_of_the_applied_twist() -> None:
+    out = Rig().driving(Twist(0.3, 1.0), steps=100).out
+    # The wheels turn at 3 and 9 rad/s.
+    assert out.line == b"ap09.00,bp03.00,cp03.00,dp09.00\r\n"
+    assert out.applied == Twist(0.3, 1.0)
+    assert out.speeds.as_tuple() == pytest.approx((9.0, 3.0, 3.0, 9.0))
+
+
+def test_a_silent_commander_is_followed_until_its_timeout_and_then_ramped_to_zero() -> None:
+    rig = Rig().driving()
+    assert rig.path(25) == [0.5] * 25
+    assert rig.path(51) == near(*(max(0.5 - 0.01 * step, 0.0) for step in range(1, 52)))
+    assert (rig.mode, rig.out.line, rig.out.code) == ("ready", ZERO_LINE, "no_command")
+
+
+@each(("refused_ms", "mode"), [(502, "ready"), (2, "ready"), (0, "driving")])
+def test_a_refused_message_disarms_only_the_zeros_before_it(refused_ms: int, mode: str) -> None:
+    rig = Rig().linked()
+    zero_ns = rig.now_ns + MS
+    refused = Refusal("malformed", "it cannot be read", "app", "", zero_ns + refused_ms * MS)
+    for number in range(150):
+        zero = (Command("app", REST, zero_ns + MS, shared=True),) if number == 0 else ()
+        rig.step(commands=zero, refusals=(refused,) if number == refused_ms // 10 else ())
+    rig.step(commands=(Command("app", GO, rig.now_ns + 10 * MS, shared=True),))
+    assert rig.mode == mode
+
+
+# the link: without it every line is zero, at once
+
+
+def test_a_lost_port_sets_zero_in_the_same_step_and_a_zero_sent_meanwhile_arms_nobody() -> None:
+    rig = Rig().driving()
+    out = rig.unplug().step(tick=False)
+    assert (out.mode, out.link, out.linked) == ("waiting", "down", False)
+    assert (out.applied, out.speeds) == (REST, STILL)
+    assert {source.age_s for source in rig.snapshot.sources} == {None}
+    rig.step(REST)
+    rig.replug().step(GO)
+    assert rig.drives()
+
+
+def test_a_silent_board_gets_only_zeros_ten_times_a_second() -> None:
+    rig = Rig().driving()
+    rig.reply = None
+    assert rig.path(10, GO) == [0.5] * 10
+    out = rig.step(GO)
+    assert (out.applied, out.link, out.mode, out.code) == (
+        REST, "stale", "waiting", "simulator_fault",
+    )  # fmt: skip
+    lines = [out.line, *(out.line for out in rig.each(99, GO))]
+    assert [index for index, line in enumerate(lines) if line] == list(range(0, 100, 10))
+    assert {line for line in lines if line} == {ZERO_LINE}
+
+
+def test_three_good_lines_after_the_question_make_the_robot_ready() -> None:
+    rig = Rig()
+    outs = [rig.step(REST), *rig.each(5, GO)]
+    assert [(out.link, out.linked) for out in outs] == [("booting", False)] * 4 + [("up", True)] * 2
+    assert {out.mode for out in outs[:4]} == {"waiting"}
+    assert [out.line for out in outs[:4]] == [ZERO_LINE, b"?\r\n", ZERO_LINE, ZERO_LINE]
+    rig = Rig()
+    rig.reply = None
+    assert [out.line for out in rig.each(2)] == [ZERO_LINE, None]
+
+
+def test_after_a_short_gap_the_robot_ramps_up_from_zero_and_after_a_long_one_needs_a_zero() -> None:
+    rig = Rig().driving()
+    reply, rig.reply = rig.reply, None
+    rig.run(50, GO)
+    rig.reply = reply
+    assert rig.path(5, GO) == near(0.0, 0.0, 0.01, 0.02, 0.03)
+    rig.reply = None
+    rig.run(101, GO)
+    rig.reply = reply
+    assert rig.drives()
+
+
+def test_a_port_reopened_between_two_steps_is_a_new_session() -> None:
+    rig = Rig().driving()
+    out = rig.replug().step(GO)
+    assert (out.link, out.applied) == ("booting", REST)
+    assert rig.drives()
+
+
+def test_a_link_that_comes_up_between_two_ticks_says_what_the_robot_waits_for() -> None:
+    rig = Rig()
+    rig.run(2)
+    out = rig.step(ms=0.5, tick=False)
+    rig.reply = rig.codec.stop * 3
+    out = rig.step(GO, ms=0.5, tick=False)
+    assert (out.mode, out.code, out.status_changed) == ("ready", "neutral", True)
+
+
+# lines that did not leave
+
+
+def test_after_superseded_lines_the_speed_grows_from_the_last_line_that_left() -> None:
+    # Every second line leaves, so two periods have passed since the last sent one.
+    rig = Rig().linked()
+    rig.step(REST)
+    assert rig.path(2, GO) == near(0.01, 0.02)
+    assert rig.path(2, GO, superseded=True) == near(0.03, 0.04)  # 0.01, and 20 and 30 ms
+    assert rig.path(1, GO) == near(0.05)
+    rig = Rig().driving(Twist(0.1, 0.0))
+    fast = Twist(1.0, 0.0)
+    rig.run(2, fast)  # 0.11 m/s was sent; no later line leaves
+    assert max(rig.path(23, fast, superseded=True)) <= 0.11 + 0.05 + 1e-9
+
+
+def test_a_ramp_brakes_for_the_whole_elapsed_time() -> None:
+    rig = Rig().driving()
+    assert rig.path(26)[-1] == pytest.approx(0.49)
+    rig.step()  # this line does not leave
+    assert rig.path(1, superseded=True) == near(0.47)  # 0.49 and 20 ms
+    rig = Rig().driving()
+    rig.run(25)
+    assert rig.path(1, ms=200) == near(0.3)
+
+
+def test_after_250_ms_without_a_line_that_left_the_speed_starts_from_zero() -> None:
+    rig = Rig().driving()
+    assert rig.step(ms=250).applied == GO
+    assert rig.step(ms=260).applied == REST
+    assert next(speed for speed in rig.path(11, GO) if speed) == pytest.approx(0.01)
+    rig = Rig().driving()
+    rig.step(GO)  # the first line that does not leave; the board received the one before it last
+    path = rig.path(26, GO, superseded=True)
+    assert path == [0.5] * 24 + [0.0, 0.0]  # from 20 to 250 ms
+
+
+SLOW = Config(
+    control=ControlConfig(rate=10.0),
+    limits=LimitsConfig(linear_acceleration=0.2),
+    commands=CommandsConfig(sources=(Source("app", 50, 1.0),)),
+)
+
+
+def test_a_stall_adds_at_most_50_ms_of_acceleration_or_one_and_a_half_periods() -> None:
+    rig = Rig().linked()
+    rig.step(REST)
+    rig.step(GO)
+    assert rig.path(1, ms=200) == near(0.01 + 0.05)
+    rig = Rig(SLOW).linked()
+    rig.step(REST)
+    assert rig.path(1, GO, ms=100) == near(0.02)
+    assert rig.path(1, GO, ms=240) == near(0.05)
+
+
+def test_the_question_that_takes_the_place_of_a_line_is_no_step_of_the_ramp() -> None:
+    rig = Rig(SLOW).linked()
+    rig.step(REST)
+    for _ in range(20):
+        before = rig.out.applied.linear
+        rig.reply = rig.out.line  # a board that repeats its commands is asked
+        if rig.step(GO).line == b"?\r\n":
+            break
+    assert rig.out.line == b"?\r\n"
+    assert 0.0 < before < 0.4
+    # The last line that moved the motors is two periods old: the speed grows by 1.5.
+    assert rig.path(1, GO) == near(before + 0.03)
+
+
+def test_a_line_superseded_before_the_port_was_lost_does_not_bring_its_speed_back() -> None:
+    for ticks in ((True,) * 3, (True, True, True, False, False)):
+        rig = Rig().driving()
+        rig.step(GO)  # this line does not leave
+        rig.replug()
+        assert rig.step(GO, superseded=True).applied == REST
+        for tick in ticks[1:]:
+            rig.step(GO, tick=tick)
+        rig.reply = rig.codec.stop * 3
+        assert rig.step(GO, superseded=True).link == "up"
+        assert rig.out.applied.linear <= 0.05
+
+
+# the pose and the settings
+
+
+def test_odometry_follows_the_wheels() -> None:
+    rig = Rig(watched=True).linked()
+    rig.reply = rig.codec.encode(ROLLING)
+    (estimate,) = rig.run(100).estimates
+    # 0.5 m/s for 1 s
+    assert estimate.pose.x == pytest.approx(0.5)
+    assert estimate.twist == Twist(0.5, 0.0)
+    assert estimate.positions == pytest.approx((10.0,) * 4)
+    assert estimate.covariance.xx == pytest.approx(1e-6 + 0.5e-4, rel=0.05)  # 1e-4 m2 per metre
+    snapshot = rig.snapshot
+    assert (snapshot.pose, snapshot.measured) == (estimate.pose, estimate.twist)
+    assert snapshot.speeds == ROLLING
+    # No jump over a lost port.
+    rig.unplug().step(ms=3000)
+    assert rig.replug().step(ms=3000).estimates[-1].pose.x == pytest.approx(
+        estimate.pose.x, abs=0.01
+    )
+    rig.run(60)
+    before = rig.robot.travelled
+    rig.reply = rig.codec.encode(WheelSpeeds(-10.0, -10.0, -10.0, -10.0))
+    rig.run(100)
+    assert rig.robot.travelled == pytest.approx(before + 0.5, abs=0.03)  # forwards and backwards
+
+
+def test_the_pose_is_set_by_request_and_the_robot_drives_on() -> None:
+    rig = Rig().driving()
+    assert rig.answer("set_pose", Pose(1.0, 2.0, 0.5)).success
+    out = rig.step(GO)
+    assert (out.estimates[-1].pose, out.mode, out.applied) == (Pose(1.0, 2.0, 0.5), "driving", GO)
+    assert rig.answer("reset_odometry").success
+    assert rig.step().estimates[-1].pose == Pose()
+
+
+def test_a_setting_applies_at_once_and_a_refused_one_changes_nothing() -> None:
+    rig = Rig().linked()
+    before = rig.robot.config
+    answer = rig.set({"limits.linear_speed": -1.0})
+    assert not answer.success
+    assert "limits.linear_speed" in answer.message
+    assert rig.robot.config is before
+    # With another timeout each sender must be neutral again.
+    assert rig.set({"commands.sources.app.timeout": 0.5}).success
+    rig.step(GO)
+    assert rig.snapshot.sources[1].waits_for.what == "neutral"
+    rig.step(REST)
+    assert rig.run(45, GO).mode == "driving"
+    assert rig.run(45).mode == "driving"
+    assert rig.set({"limits.linear_speed": 0.3}).success
+    assert rig.run(30, GO).applied.linear == pytest.approx(0.3)
+
+
+def test_settings_for_a_robot_at_rest_are_refused_until_the_zero_lines_were_sent() -> None:
+    rig = Rig().driving()
+    rig.step(ask="stop", superseded=True)
+    rig.run(19, superseded=True)
+    softer: dict[str, Plain] = {
+        "limits.linear_deceleration": 0.3, "limits.linear_stop_deceleration": 0.5,
+    }  # fmt: skip
+    assert rig.out.applied == REST
+    request = Request("set", 7, settings=softer)
+    assert not rig.asked(request, superseded=True).answers[0].success
+    rig.run(2)
+    assert rig.set(softer).success
+
+
+def test_a_stall_before_the_first_reply_of_a_new_port_is_integrated_once() -> None:
+    rig = Rig().linked()
+    rig.reply = rig.codec.encode(ROLLING)
+    rig.run(20)
+    rig.unplug().step()
+    before = rig.replug().robot.travelled
+    rig.step(ms=120)
+    rig.run(2)
+    # 0.5 m/s for at most 0.15 s.
+    assert rig.robot.travelled - before <= 0.075

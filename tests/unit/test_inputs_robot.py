@@ -1,0 +1,347 @@
+"""What the robot does with the inputs of the board: emergency stop, bumpers, motor drivers."""
+
+from __future__ import annotations
+
+import pytest
+
+from acsard.core.config.settings import Config, McuConfig, SafetyConfig
+from acsard.core.motion.latches import after_restart
+from acsard.core.values import REST, STILL, Twist, WheelSpeeds
+from tests.each import each
+from tests.unit.rig import GO, ROLLING, ZERO_LINE, Rig, names
+
+# the emergency stop
+
+OK, PRESSED = b"!status estop=ok\r\n", b"!status estop=pressed\r\n"
+
+
+def test_a_press_sends_zero_and_latches_in_the_same_step_until_a_clear_and_a_zero() -> None:
+    rig = Rig(status=OK).driving()
+    out = rig.board(PRESSED).step(GO)
+    assert (out.mode, out.line, out.speeds, out.code) == (
+        "stopped", ZERO_LINE, STILL, "emergency_stop",
+    )  # fmt: skip
+    assert {"emergency_stop", "mode"} <= set(names(out))
+    assert rig.counters["emergency_stops"] == 1
+    assert rig.snapshot.estop == "pressed"
+    assert rig.snapshot.board == {"emergency_stop": "pressed", "age_s": "0.0"}
+    # A line that was not sent is repeated as zero.
+    assert {out.line for out in rig.each(3, GO, superseded=True)} == {ZERO_LINE}
+    assert not rig.answer("clear").success
+    rig.board(OK).step(GO)
+    assert rig.mode == "stopped"
+    assert rig.answer("clear").success
+    assert rig.drives()
+
+
+def test_a_press_between_two_ticks_is_zero_at_once_whether_or_not_a_line_may_leave() -> None:
+    for at_once in (True, False):
+        rig = Rig(status=OK).driving()
+        rig.board(PRESSED)
+        out = rig.step(GO, tick=False, at_once=at_once)
+        line = ZERO_LINE if at_once else None
+        assert (out.mode, out.line, out.speeds) == ("stopped", line, STILL)
+        assert rig.step(GO).line == ZERO_LINE
+
+
+def test_a_press_that_was_released_in_the_same_read_stays_a_stop() -> None:
+    rig = Rig(status=OK).driving()
+    rig.board(PRESSED + OK).step(ask="stop")
+    assert rig.answer("clear").message.startswith("cleared, but the robot is still stopped")
+    outs = rig.board(OK).each(200, GO)
+    assert {(o.mode, o.line, o.code) for o in outs} == {("stopped", ZERO_LINE, "emergency_stop")}
+
+
+def test_a_button_that_falls_silent_counts_as_pressed_even_without_a_port() -> None:
+    rig = Rig(status=OK).linked().unplug()
+    assert {out.mode for out in rig.each(50)} == {"waiting"}
+    assert (rig.step().mode, rig.snapshot.estop) == ("stopped", "silent")
+    rig = Rig(status=OK).linked()  # also if the port reopens again and again
+    rig.reply = None
+    for _ in range(12):
+        rig.unplug().step()
+        rig.replug().run(10)
+    assert (rig.mode, rig.snapshot.estop) == ("stopped", "silent")
+
+
+def test_wheels_that_roll_without_power_cause_no_fault() -> None:
+    rig = Rig(watched=True)
+    rig.linked().step(REST)
+    for _ in range(100):
+        speed = rig.step(GO).speeds.front_left
+        # Equal speeds would be an echo of the lines.
+        rig.reply = rig.codec.encode(WheelSpeeds(*[0.95 * speed] * 4))
+    assert rig.mode == "driving"
+    rig.reply = rig.codec.encode(ROLLING)
+    assert {out.mode for out in rig.board(PRESSED).each(300)} == {"stopped"}
+
+
+def test_status_lines_are_no_replies_and_damaged_ones_change_nothing() -> None:
+    plain, other = Rig(), Rig()
+    other.reply = OK + plain.codec.stop
+    for _ in range(100):
+        a, b = plain.step(), other.step()
+        assert (a.line, a.mode, a.link, a.estimates) == (b.line, b.mode, b.link, b.estimates)
+    rig = Rig(status=b"!status estop=prxssed\r\n!status estop=ok*0000\r\n").driving()
+    assert rig.run(20, GO).mode == "driving"
+    assert rig.counters["line_status_malformed"] > 50
+    assert rig.counters["line_status_crc_error"] > 50
+    assert rig.snapshot.board == {}
+    rig = Rig()
+    rig.reply = OK
+    assert rig.run(400).code == "received_statuses"
+    rig = Rig(Config(mcu=McuConfig(link_check="on")), status=OK)
+    rig.step()
+    assert rig.counters["line_status_without_crc"] == 1
+    rig.board(b"!status estop=ok*9C94\r\n").step()
+    assert rig.snapshot.estop == "released"
+
+
+# bumpers
+
+FREE, FRONT, REAR, BOTH = [b"!status bumpers=%b\r\n" % m for m in (b"..", b"X.", b".X", b"XX")]
+AWAY = Config(safety=SafetyConfig(bumpers=("front", "rear"), bumper="away"))
+BACK = Twist(-0.5, 0.4)
+
+
+def test_a_bumper_stops_the_robot_at_once_until_a_clear_after_the_release() -> None:
+    rig = Rig(status=FREE).driving()
+    out = rig.board(FRONT).step(GO)
+    assert (out.mode, out.line, out.code) == ("stopped", ZERO_LINE, "bumper")
+    assert {"bumper_pressed", "mode"} <= set(names(out))
+    assert rig.counters["bumper_presses"] == 1
+    assert rig.snapshot.bumpers == (True, False)
+    assert rig.snapshot.bumper is not None
+    assert rig.snapshot.bumper.code == "bumper"
+    assert not rig.answer("clear").success
+    assert rig.board(FREE).step(GO).mode == "stopped"
+    assert rig.answer("clear").success
+    assert rig.drives()
+
+
+def test_a_bumper_that_limits_stops_once_and_then_allows_the_retreat() -> None:
+    for status in (FRONT, FRONT + FREE):
+        rig = Rig(AWAY, status=FREE).driving()
+        out = rig.board(status).step(GO)
+        assert (out.mode, out.line, out.latches.causes) == ("ready", ZERO_LINE, ())
+        if status == FRONT + FREE:
+            assert rig.board(FREE).drives()
+            continue
+        assert out.code == "bumper_away"
+        assert {out.line for out in rig.each(50, BACK)} == {ZERO_LINE}
+        rig.step(REST)
+        for out in rig.each(50, BACK):
+            assert -0.1 <= out.applied.linear < 0.0
+            assert out.applied.angular == 0.0
+        assert (out.mode, out.code, out.applied.linear) == ("driving", "bumper_away", -0.1)
+        # After the release the retreat goes on without the limit.
+        out = rig.board(FREE).run(100, BACK)
+        assert (out.mode, out.code, out.applied) == ("driving", "commanded", BACK)
+
+
+@each("wrong", [GO, Twist(0.0, 1.0), Twist(0.001, -0.5)])
+def test_a_command_against_a_pressed_bumper_makes_its_sender_unarmed(wrong: Twist) -> None:
+    rig = Rig(AWAY, status=FRONT)
+    rig.linked().step(REST)
+    assert {(out.mode, out.line) for out in rig.each(20, wrong)} == {("ready", ZERO_LINE)}
+    assert rig.snapshot.sources[1].waits_for.what == "neutral"
+    assert rig.board(FREE).drives()
+
+
+def test_a_bumper_in_the_direction_of_the_retreat_ends_it() -> None:
+    rig = Rig(AWAY, status=FRONT)
+    rig.linked().step(REST)
+    rig.run(20, BACK)
+    out = rig.board(BOTH).step(BACK)
+    assert (out.mode, out.line) == ("ready", ZERO_LINE)
+    assert {rig.step(twist).line for twist in (REST, BACK, REST, GO)} == {ZERO_LINE}
+    assert rig.board(REAR).step(REST).mode == "driving"
+    assert rig.run(2, GO).applied.linear > 0.0
+
+
+def test_silent_bumpers_latch_a_stop_also_if_a_press_would_only_limit() -> None:
+    rig = Rig(AWAY, status=FREE).driving()
+    out = rig.board(b"").run(51, GO)
+    assert (out.mode, out.code) == ("stopped", "bumpers_silent")
+    assert rig.snapshot.bumpers == (True, True)
+
+
+# the motor drivers
+
+DRIVER_OK, FAULT = b"!status driver=ok\r\n", b"!status driver=fault\r\n"
+
+
+def test_a_drivers_fault_is_latched_until_a_clear_after_its_end() -> None:
+    rig = Rig(status=DRIVER_OK).driving()
+    out = rig.board(FAULT).step(GO)
+    assert (out.mode, out.code) == ("fault", "driver_fault")
+    assert not rig.answer("clear").success
+    assert rig.board(DRIVER_OK).step(GO).mode == "fault"
+    # Nor does a clear in the step in which it comes again.
+    assert not rig.board(FAULT + DRIVER_OK).answer("clear").success
+    assert rig.mode == "fault"
+    assert rig.board(DRIVER_OK).answer("clear").success
+    assert rig.step(GO).mode == "ready"
+
+
+@each(
+    ("before", "lines", "mode"),
+    [
+        # After a press the drivers have no power, and report that as a fault.
+        (b"", PRESSED + FAULT + OK + DRIVER_OK, "stopped"),
+        (b"", b"!status estop=pressed driver=fault\r\n!status estop=ok driver=ok\r\n", "stopped"),
+        (PRESSED, FAULT + OK + DRIVER_OK, "stopped"),
+        (PRESSED, b"!status driver=fault estop=pressed\r\n" + OK + DRIVER_OK, "stopped"),
+        (b"", FAULT + PRESSED, "stopped"),
+        (b"", PRESSED + OK + FAULT + DRIVER_OK, "stopped"),
+        (PRESSED, OK + FAULT + DRIVER_OK, "stopped"),
+        (PRESSED, b"!status estop=ok driver=fault\r\n" + DRIVER_OK, "stopped"),
+        (b"", PRESSED + OK + DRIVER_OK + FAULT, "stopped"),
+        (PRESSED, OK + DRIVER_OK + FAULT, "stopped"),
+        (PRESSED, b"!status estop=ok driver=ok\r\n" + FAULT, "stopped"),
+        # A fault before it counts.
+        (b"", FAULT + PRESSED + OK + DRIVER_OK, "fault"),
+        (b"", FAULT + OK + DRIVER_OK, "fault"),
+    ],
+)
+def test_a_driver_fault_counts_if_it_was_reported_before_the_press(
+    before: bytes, lines: bytes, mode: str
+) -> None:
+    rig = Rig(status=OK + DRIVER_OK).linked()
+    if before:
+        rig.board(before + DRIVER_OK).step()
+    assert rig.board(lines).step().mode == mode
+
+
+@each("restarted", [False, True])
+def test_drivers_without_power_after_a_press_block_the_clear_until_they_recover(
+    restarted: bool,
+) -> None:
+    rig = Rig(status=OK + DRIVER_OK).linked()
+    rig.board(PRESSED).step()
+    if restarted:
+        rig = Rig(latches=after_restart(rig.out.latches), status=OK + FAULT).linked()
+    rig.board(OK + DRIVER_OK).step()
+    assert rig.board(OK + FAULT).step().mode == "stopped"
+    assert not rig.answer("clear").success
+    rig.board(OK + DRIVER_OK).step()
+    assert rig.answer("clear").success
+    assert rig.board(OK + FAULT).step().mode == "fault"
+
+
+def test_a_driver_fault_while_nobody_knows_of_a_press_does_not_count_and_then_does() -> None:
+    silent = Rig(status=OK + DRIVER_OK).linked()
+    assert silent.board(b"").run(60).mode == "stopped"
+    assert silent.board(FAULT + OK + DRIVER_OK).step().mode == "stopped"
+    silent.board(OK).step()
+    assert silent.board(OK + FAULT).step().mode == "fault"
+    never_ok = Rig(status=OK).linked()
+    never_ok.board(PRESSED).step()
+    never_ok.board(OK).step()
+    assert never_ok.answer("clear").success
+    assert never_ok.board(OK + FAULT).step().mode == "fault"
+    ignored = Rig(Config(safety=SafetyConfig(estop="off")), status=PRESSED + FAULT)
+    assert ignored.linked().mode == "fault"
+
+
+def test_after_a_clear_of_only_the_fault_drivers_may_still_lack_power() -> None:
+    rig = Rig(status=OK + DRIVER_OK).linked()
+    rig.board(PRESSED).step()
+    assert rig.board(OK + DRIVER_OK).step(guard_trip="guard_line_damaged").mode == "fault"
+    rig.step()
+    assert rig.answer("clear").success
+    assert rig.mode == "stopped"
+    assert rig.board(OK + FAULT).step().mode == "stopped"
+
+
+# another board, or a restart
+
+
+def replugged(rig: Rig, status: bytes, closed: int = 100) -> Rig:
+    """Plug in a board that sends this status line, and wait until the link is up."""
+    rig.unplug().run(closed)
+    return rig.board(status).replug().linked()
+
+
+@each("line", [FAULT, PRESSED, FRONT, OK])
+def test_a_board_that_reports_no_inputs_does_not_inherit_those_of_the_previous_one(
+    line: bytes,
+) -> None:
+    rig = replugged(Rig(status=line).linked(), b"")
+    mode = "fault" if line == FAULT else "stopped"
+    assert {out.mode for out in rig.each(290, GO)} == {mode}
+    assert not rig.answer("clear").success
+    rig.run(20, GO)
+    assert (rig.snapshot.estop, rig.snapshot.bumpers, rig.snapshot.board) == ("", None, {})
+    while rig.out.latches.causes:
+        assert rig.answer("clear").success
+    assert rig.drives()
+
+
+@each("late", [[(0, 5000)], [(120, 90)] * 3])
+def test_late_steps_do_not_shorten_the_time_for_the_reports_of_a_new_board(
+    late: list[tuple[int, int]],
+) -> None:
+    rig = replugged(Rig(status=FAULT).linked(), b"")
+    for steps, ms in late:
+        assert not rig.answer("clear").success
+        rig.each(steps)
+        rig.step(ms=ms)
+    if len(late) == 1:
+        assert not rig.answer("clear").success
+        rig.run(310)
+    assert rig.answer("clear").success
+
+
+@each("new", [replugged, lambda rig, _: rig.board(b"!acsard-mcu 1\r\n")])
+def test_a_board_that_has_reported_a_press_must_report_the_release(new: type) -> None:
+    rig = Rig(status=PRESSED).linked()
+    new(rig, b"")
+    rig.step()
+    rig.board(b"")
+    assert not any(rig.answer("clear").success for _ in range(100))
+    if new is replugged:
+        rig.board(PRESSED)
+    assert not any(rig.answer("clear").success for _ in range(500))
+    rig.board(OK).step()
+    assert rig.answer("clear").success
+
+
+def test_each_board_must_report_the_required_inputs_before_the_robot_is_ready() -> None:
+    one = b"!status estop=ok bumpers=.\r\n"
+    rig = Rig(Config(safety=SafetyConfig(estop="required", bumpers=("front",))))
+    out = rig.linked().step(GO)
+    assert (out.mode, out.link, out.line) == ("waiting", "up", ZERO_LINE)
+    for closed in (0, 3):
+        if closed:
+            out = replugged(rig, b"", closed).step()
+        assert (out.mode, out.link, out.code) == ("waiting", "up", "emergency_stop_missing")
+        out = rig.board(OK).step()
+        assert (out.mode, out.link, out.code) == ("waiting", "up", "bumpers_missing")
+        if not closed:
+            assert rig.board(one).step().mode == "ready"
+            assert rig.drives()
+    # A board with another number of bumpers is refused, also behind a board with the right one.
+    modes = {out.mode for out in rig.board(b"!status estop=ok bumpers=..\r\n").each(400)}
+    assert modes == {"waiting", "stopped"}
+    assert (rig.answer("clear").success, rig.mode) == (True, "waiting")
+    assert rig.board(one).step().mode == "ready"
+
+
+def test_a_restarted_daemon_allows_clear_after_3_s_without_a_report() -> None:
+    rig = Rig(latches=after_restart(Rig(status=PRESSED).linked().out.latches)).linked()
+    allowed = [rig.answer("clear").success for _ in range(320)]
+    assert 290 < allowed.index(True) < 310
+
+
+@pytest.mark.parametrize("line", [PRESSED, OK + FAULT, REAR])
+def test_a_restarted_daemon_refuses_clear_until_the_board_has_reported_the_cause(
+    line: bytes,
+) -> None:
+    latches = after_restart(Rig(status=line).linked().out.latches)
+    rig = Rig(latches=latches).linked()
+    assert (rig.out.latches, rig.out.code) == (latches, latches.of("fault", "stop")[0].code)
+    assert not rig.answer("clear").success
+    # A new number of bumpers counts from its second line on.
+    rig.board(b"!status estop=ok driver=ok bumpers=..\r\n").run(3)
+    assert rig.answer("clear").success

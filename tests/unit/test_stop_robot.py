@@ -1,0 +1,161 @@
+"""What ends the motion of a robot: stop, switching off, faults, the end of the daemon."""
+
+from __future__ import annotations
+
+import pytest
+
+from acsard.core.config.settings import Config
+from acsard.core.robot import Robot
+from acsard.core.values import (
+    NS_PER_S,
+    REST,
+    Instant,
+    Received,
+    Request,
+    Verb,
+    WheelSpeeds,
+)
+from tests.each import each
+from tests.stepped import Inputs, SteppedRobot
+from tests.unit.rig import GO, MS, ZERO_LINE, Rig
+
+
+@each(
+    ("ask", "again", "mode", "code", "braked"),
+    [
+        ("stop", "clear", "stopped", "stopped", 0.03),
+        ("deactivate", "activate", "inactive", "switched_off", 0.01),
+    ],
+)
+def test_a_latched_request_brakes_by_its_deceleration_until_it_is_released(
+    ask: Verb, again: Verb, mode: str, code: str, braked: float
+) -> None:
+    rig = Rig().driving()
+    answer = rig.answer(ask)
+    (cause,) = rig.robot.latches.causes
+    assert (answer.success, answer.numbers) == (True, (cause.number,))
+    path = [rig.out.applied.linear, *rig.path(51, GO)]
+    expected = [max(0.5 - braked * step, 0.0) for step in range(1, 53)]
+    assert path == pytest.approx(expected, abs=1e-12)
+    assert (rig.mode, rig.out.code) == (mode, code)
+    answer = rig.answer(again)
+    assert (answer.success, answer.numbers) == (True, (cause.number,))
+    assert rig.drives()
+
+
+def test_a_clear_without_a_latch_changes_nothing_and_activate_asks_for_a_zero() -> None:
+    rig = Rig().driving()
+    out = rig.step(GO, ask="clear")
+    assert (out.answers[0].success, out.answers[0].numbers) == (True, ())
+    assert (out.mode, out.applied) == ("driving", GO)
+    rig.step(GO, ask="activate")
+    assert rig.drives()
+
+
+def test_several_requests_of_one_step_are_answered_in_order() -> None:
+    rig = Rig().linked()
+    out = rig.asked(Request("stop", 1), Request("activate", 2), Request("reset_odometry", 3))
+    assert [(a.id, a.success) for a in out.answers] == [(1, True), (2, False), (3, True)]
+    for order in (("stop", "clear"), ("clear", "stop")):
+        assert rig.asked(*(Request(verb) for verb in order)).mode == "stopped"
+
+
+# faults
+
+
+def test_a_guard_trip_is_a_fault_from_the_stop_line_that_was_sent() -> None:
+    rig = Rig().driving()
+    out = rig.step(guard_trip="guard_too_fast")
+    assert {source.age_s for source in rig.snapshot.sources} == {None}
+    assert (out.mode, out.code, out.line) == ("fault", "guard_too_fast", ZERO_LINE)
+    event, mode = out.events
+    assert (event.name, event.level) == ("fault", "error")
+    assert (event.code, mode.code) == ("guard_too_fast", "guard_too_fast")
+    assert {source.age_s for source in rig.snapshot.sources} == {
+        rig.snapshot.sources[1].age_s,
+        None,
+    }
+    rig.step(REST)
+    assert {(out.mode, out.applied) for out in rig.each(50, GO)} == {("fault", REST)}
+    assert rig.answer("clear").success
+    assert rig.drives()
+    # A clear in the step of a repeated trip does not release it.
+    rig.step(guard_trip="guard_line_damaged")
+    assert not rig.step(guard_trip="guard_line_damaged", ask="clear").answers[0].success
+    assert rig.mode == "fault"
+    assert rig.answer("clear").success
+
+
+IMPOSSIBLE = WheelSpeeds(99.0, 99.0, 99.0, 99.0)
+
+
+def impossible(rig: Rig, lines: int) -> Rig:
+    """Let the board send this many impossible lines, then its earlier reply again."""
+    reply, rig.reply = rig.reply, rig.codec.encode(IMPOSSIBLE)
+    rig.each(lines, GO)
+    rig.reply = reply
+    return rig
+
+
+def test_a_third_impossible_line_is_a_fault_that_brakes_by_the_stop_deceleration() -> None:
+    rig = impossible(Rig().driving(), 2)
+    assert (rig.mode, rig.out.applied) == ("driving", GO)
+    impossible(rig, 1)
+    assert (rig.mode, rig.out.code) == ("fault", "impossible_speeds")
+    # Each step removes 3 m/s2 x 10 ms.
+    assert [rig.out.applied.linear, *rig.path(1, GO)] == pytest.approx([0.47, 0.44])
+    assert rig.counters["line_implausible"] == 3
+    # A clear begins to count again.
+    rig.reply = rig.codec.encode(IMPOSSIBLE)
+    rig.step(ask="clear")
+    assert [out.mode for out in rig.each(3)] == ["ready", "ready", "fault"]
+
+
+def test_a_lost_link_begins_to_count_impossible_lines_again() -> None:
+    rig = impossible(Rig().driving(), 2)
+    rig.unplug().step()
+    impossible(rig.replug(), 5)
+    assert (rig.out.link, rig.mode) == ("up", "ready")
+
+
+def test_impossible_speeds_of_any_wheel_are_one_cause_and_hide_no_later_cause() -> None:
+    rig = impossible(Rig().driving(), 3)
+    for wheel in range(4):
+        for speed in (99.0, -99.0):
+            speeds = [0.0, 0.0, 0.0, 0.0]
+            speeds[wheel] = speed
+            rig.reply = rig.codec.encode(WheelSpeeds(*speeds))
+            rig.step(GO)
+    (first,) = rig.robot.latches.of("fault")
+    rig.step(GO, guard_trip="guard_too_fast")
+    newest, second = rig.robot.latches.of("fault")
+    assert (newest.code, second) == ("guard_too_fast", first)
+
+
+def test_the_distance_of_impossible_feedback_is_not_made_up_later() -> None:
+    rig = impossible(Rig().linked(), 100)
+    before = rig.snapshot.pose
+    assert rig.run(20).estimates[-1].pose == before
+
+
+# the end
+
+
+def test_shutting_down_ramps_to_zero_by_the_stop_deceleration_and_stays_there() -> None:
+    rig = Rig().driving()
+    rig.shutting_down = True
+    path = rig.path(20, GO)
+    assert path[:3] == pytest.approx([0.47, 0.44, 0.41])
+    assert path[17:] == [0.0, 0.0, 0.0]
+    assert (rig.mode, rig.out.code) == ("shutdown", "shutting_down")
+
+
+def test_a_flood_of_bytes_faster_than_the_wire_raises_no_error() -> None:
+    """Many reads have the same time, so the host cannot estimate the board's clock from them."""
+    robot = SteppedRobot(Robot(Config()))
+    good = b"a0.00,b0.00,c0.00,d0.00\r\n"
+    for n in range(600):
+        odd, after = n % 12 == 0, n % 12 == 1
+        data = (b"" if after else b"xxxxxxxxxx\n") + good + (b"" if odd else b"y" * 120)
+        now = Instant(1000 * NS_PER_S + n * MS, 0)
+        robot.step(Inputs(now, n % 10 == 0, True, 1, received=(Received(now, data),)))
