@@ -64,8 +64,13 @@ class Subscription:
         """Append a sample from the reply to a query, as if the sample had just been published."""
         self._queue.put(sample)
 
-    def until_silence(self, timeout: float | None) -> Iterator[zenoh.Sample]:
-        """Yield samples until the session closes or none came for `timeout` s; then undeclare."""
+    def until_silence(
+        self, timeout: float | None, look: Callable[[float], None] | None = None
+    ) -> Iterator[zenoh.Sample]:
+        """Yield samples until the session closes or none came for `timeout` s; then undeclare.
+
+        In each second of a silence, `look` is called with its length, s.
+        """
         quiet_since_ns = clock.mono_ns()
         try:
             while True:
@@ -81,6 +86,9 @@ class Subscription:
                 left_s = None if timeout is None else timeout - quiet_s
                 if left_s is not None and left_s <= 0:
                     return
+                if look is not None:
+                    look(quiet_s)
+                    left_s = 1.0 if left_s is None else min(1.0, left_s)
                 self._queue.wait(left_s)
         finally:
             self.undeclare()

@@ -9,7 +9,6 @@ import math
 from collections.abc import Sequence
 
 from acsard.bus import robot_discovery
-from acsard.cli.common import options_text
 from acsard.cli.connection import SEVERAL_IDS, add_bus, connected_to_many, several_ids
 from acsard.cli.replies import of_each, print_each
 from acsard.client.connection import Connection
@@ -21,7 +20,6 @@ from acsard.host.errors import UsageError
 
 # The service `set` is `acsard set`.
 CALLABLE_SERVICES = tuple(service for service in SERVICES if service != "set")
-
 
 RELEASES = tuple(service for service, row in SERVICES.items() if row.optional)
 
@@ -69,9 +67,11 @@ def main(args: argparse.Namespace) -> int:
     if args.service == "set":
         raise UsageError("a setting is changed with `acsard set KEY VALUE`")
     fields = _causes(args.values) if args.service in RELEASES else _fields(args)
-    if args.service != "stop" and (ids := several_ids(args)):
-        typed = (("--config", args.config), ("--connect", args.connect), ("--tls", args.tls))
-        raise UsageError(one_robot_only_text(args.service, args.values, ids, options_text(typed)))
+    if args.service != "stop" and several_ids(args):
+        raise UsageError(
+            f"only stop can be called on several robots at once: before {args.service}, a person "
+            "must look at each robot. Name one robot in --id; `acsard fleet` lists the ids"
+        )
     with connected_to_many(args) as (robot, many):
         if many:
             return _stop_all(robot, many, as_json=args.json)
@@ -106,23 +106,6 @@ def _fields(args: argparse.Namespace) -> dict[str, object]:
         if not math.isfinite(value):
             raise UsageError(f"{name.upper()} = {value}: the number must be finite; correct it")
     return dict(zip(names, values, strict=True))
-
-
-def one_robot_only_text(
-    service: str, values: Sequence[float], ids: tuple[str, ...], options: str
-) -> str:
-    """Return the error text for a service that can be called on only one robot at a time.
-
-    It has the command for each robot, with the typed numbers and the options that reach it.
-    """
-    typed = " ".join(["acsard call", service, *(f"{value:g}" for value in values), "--id"])
-    each = [robot_id for robot_id in ids if robot_id != "*"] or ["robot1"]
-    more = "" if "*" not in ids else "; `acsard fleet` lists the ids"
-    return (
-        f"only stop can be called on several robots at once: before {service}, a person must look "
-        "at each robot. Call one robot after the other: "
-        f"{', '.join(f'`{typed} {robot_id}{options}`' for robot_id in each)}{more}"
-    )
 
 
 def _stop_all(robot: Connection, ids: tuple[str, ...], *, as_json: bool) -> int:

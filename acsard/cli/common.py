@@ -5,9 +5,8 @@ from __future__ import annotations
 import argparse
 import math
 import os
-import shlex
 import sys
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 from msgspec.structs import replace
 
@@ -73,11 +72,6 @@ def whole(units: str, most: int, hint: str = "") -> Callable[[str], int]:
         return int(text)
 
     return number
-
-
-def options_text(options: Iterable[tuple[str, str | None]]) -> str:
-    """Return options as text for a command line, such as " --id robot2", if they have a value."""
-    return "".join([f" {name} {shlex.quote(value)}" for name, value in options if value])
 
 
 def overrides(options: Mapping[str, object]) -> dict[str, dict[str, object]]:

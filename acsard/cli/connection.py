@@ -3,12 +3,9 @@
 from __future__ import annotations
 
 import argparse
-import math
 import sys
-import time
-from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, contextmanager
-from threading import Event, Thread
+from collections.abc import Iterator
+from contextlib import contextmanager
 
 import zenoh
 
@@ -89,111 +86,64 @@ def connected_to_many(args: argparse.Namespace) -> Iterator[tuple[Connection, tu
         yield robot, many
 
 
-def require_followed(key: str) -> None:
-    """Raise `UsageError` for a key that does not exist, or on which nothing is published.
+# What a tool reads, by the direction of the key, and which tool uses the others.
+READABLE = {"echo": ("out", "in"), "get": ("out", "query")}
+INSTEAD = {
+    "query": "has no messages and only answers queries: type acsard get {0}",
+    "in": "is an input and does not answer queries: type acsard echo {0} to print the messages "
+    "that arrive on it",
+    "service": "is a service: type acsard call {1}",
+    "alive": "is a Zenoh liveliness token: acsard fleet lists the robots that are present",
+}
 
-    A misspelt key would look like a silent robot. A key may contain wildcards.
+
+def require_readable(key: str, verb: str) -> None:
+    """Raise `UsageError` if `acsard echo` or `acsard get` cannot read this key.
+
+    A query of a service would call it, and a misspelt key would look like a silent robot.
     """
-    if unknown(key) and not set(key) & set("*$"):
-        raise UsageError(f"{key} is not a key of the robot: {key_hint(key)}")
-    row = row_of(key)
-    if row is None:
-        return
-    instead = {
-        "query": f"has no messages and only answers queries: type acsard get {key}",
-        "service": f"is a service without messages: type acsard call {key.removeprefix('srv/')}",
-    }.get(row.direction)
-    if row.key == "alive":
-        instead = (
-            "is a Zenoh liveliness token without messages: acsard fleet lists the robots that are "
-            "present"
-        )
-    if instead is not None:
-        raise UsageError(f"the key {key} {instead}")
-
-
-def require_asked(key: str) -> None:
-    """Raise `UsageError` if `acsard get` cannot query this key.
-
-    It must answer, not have a wildcard (only one answer is printed), and not be a service, which a
-    query would call.
-    """
-    if set(key.partition("?")[0]) & set("*$"):
+    has_wildcard = set(key.partition("?")[0]) & set("*$")
+    if has_wildcard and verb == "get":
         raise UsageError(
             f"{key} stands for several keys, but get queries only one; `acsard topics` lists them"
         )
     row = row_of(key)
     if row is None:
+        if unknown(key) and not has_wildcard and verb == "echo":
+            raise UsageError(f"{key} is not a key of the robot: {key_hint(key)}")
         return
-    if row.direction == "service":
-        raise UsageError(f"{key} is a service: type acsard call {key.removeprefix('srv/')}")
-    if row.direction == "in":
-        raise UsageError(
-            f"{key} is an input and does not answer queries: type acsard echo {key} to print the "
-            "messages that arrive on it"
-        )
-    if row.key == "alive":
-        raise UsageError(
-            "the key alive is a Zenoh liveliness token and does not answer queries: acsard fleet "
-            "lists the robots that are present"
-        )
+    kind = row.key if row.key == "alive" else row.direction
+    if kind not in READABLE[verb]:
+        raise UsageError(f"{key} {INSTEAD[kind].format(key, key.removeprefix('srv/'))}")
 
 
-@contextmanager
-def explained(
-    look: Callable[[], str],
-    ceased: Callable[[], str] | None = None,
-    after_s: float = FIRST_STATE_TIMEOUT_S,
-    timeout_s: float = math.inf,
-) -> Iterator[Callable[[], None]]:
-    """Yield a function to be called for each message, and print the reason if none arrives.
+class Silence:
+    """Prints, once in each silence of a key, why no message arrives.
 
-    A thread does this on standard error. `look` is asked once after `after_s`, and `ceased` every
-    `after_s` of a later silence until it has a reason; "" prints nothing. The block ends by itself
-    after `timeout_s` without a message, and the reason is printed before if there was none.
+    Without a key, or after the first message, the only reason is a lost connection.
     """
-    come, end, looked = Event(), Event(), Event()
-    began_s = time.monotonic()
 
-    def print_reason(reason: str) -> bool:
-        if reason and not come.is_set():
+    def __init__(self, robot: Connection, key: str) -> None:
+        self._robot, self._key = robot, key
+        self._said, self._due_s = False, FIRST_STATE_TIMEOUT_S
+
+    def heard(self) -> None:
+        self._key, self._said, self._due_s = "", False, FIRST_STATE_TIMEOUT_S
+
+    def look(self, quiet_s: float) -> None:
+        """Look for a reason, if the silence has lasted long enough since the last look."""
+        if quiet_s >= self._due_s:
+            self._due_s = quiet_s + FIRST_STATE_TIMEOUT_S
+            self.explain()
+
+    def explain(self) -> None:
+        """Look for a reason, and print it if it is the first one in this silence."""
+        if self._said:
+            return
+        reason = _none_yet(self._robot, self._key) if self._key else _ceased(self._robot)
+        if reason:
             print(f"acsard: {printable(reason)}", file=sys.stderr, flush=True)
-        return bool(reason)
-
-    def print_reasons() -> None:
-        try:
-            reported = not come.wait(min(after_s, timeout_s)) and print_reason(look())
-        finally:
-            looked.set()
-        while ceased is not None and not end.wait(after_s):
-            if come.is_set():
-                come.clear()
-                reported = False
-            elif not reported:
-                reported = print_reason(ceased())
-
-    Thread(name="waiting", target=print_reasons, daemon=True).start()
-    try:
-        yield come.set
-        if time.monotonic() - began_s >= timeout_s:
-            looked.wait()
-    finally:
-        end.set()
-        come.set()
-
-
-def silence_explained(
-    robot: Connection, key: str, timeout_s: float | None = None
-) -> AbstractContextManager[Callable[[], None]]:
-    """Return `explained` for a key, or if it is "", only for a lost connection.
-
-    The caller leaves the context after `timeout_s` without a message.
-    """
-    return explained(
-        lambda: _none_yet(robot, key) if key else "",
-        lambda: _ceased(robot),
-        timeout_s=math.inf if timeout_s is None else timeout_s,
-    )
+            self._said = True
 
 
 def _none_yet(robot: Connection, key: str) -> str:

@@ -12,7 +12,7 @@ import itertools
 import sys
 import time
 from collections import deque
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Collection, Iterator
 from itertools import pairwise
 from statistics import fmean, pstdev, quantiles
 from typing import Any
@@ -24,12 +24,12 @@ from acsard.bus.subscription import encoded
 from acsard.cli.common import between, whole
 from acsard.cli.connection import (
     SEVERAL_IDS,
+    Silence,
     add_bus,
     connected,
     connected_to_many,
-    require_followed,
+    require_readable,
     several_ids,
-    silence_explained,
 )
 from acsard.cli.replies import json_line, of_robot
 from acsard.client.connection import Connection
@@ -79,24 +79,22 @@ def main(args: argparse.Namespace) -> int:
     if args.rate and several_ids(args):
         raise UsageError("with --rate, name one robot in --id")
     short_form = _shortened(topic) if args.short else None
-    require_followed(topic)
+    require_readable(topic, "echo")
     if args.rate:
-        with connected(args) as robot, silence_explained(robot, topic) as on_message:
-            return _print_rates(robot, topic, args.n, on_message)
+        with connected(args) as robot:
+            return _print_rates(robot, topic, args.n)
     with connected_to_many(args) as (robot, many):
-        samples = robot.samples(topic, args.timeout)
-        unexplained = topic
-        quota = Quota(args.n, {""})
+        silence, quota = Silence(robot, topic), Quota(args.n, {""})
         if many:
-            samples = follow(robot.session, many, topic).until_silence(args.timeout)
-            quota = Quota(args.n, _expected(robot, many))
-            unexplained = ""
-        elif robot.where.tls and (why := robot.whoami().silence):
-            print(f"acsard: {why}. Waiting.", file=sys.stderr)
-            # The reason for the silence has just been printed.
-            unexplained = ""
-        with silence_explained(robot, unexplained, args.timeout) as on_message:
-            return _print(samples, short_form, quota, bool(many), args.timeout, on_message)
+            silence, quota = Silence(robot, ""), Quota(args.n, _expected(robot, many))
+            subscription = follow(robot.session, many, topic)
+            samples = subscription.until_silence(args.timeout, silence.look)
+        else:
+            samples = robot.samples(topic, args.timeout, silence.look)
+            if robot.where.tls and (why := robot.whoami().silence):
+                print(f"acsard: {why}. Waiting.", file=sys.stderr)
+                silence.heard()  # the reason for the silence has just been printed
+        return _print(samples, short_form, quota, bool(many), args.timeout, silence)
 
 
 class Quota:
@@ -127,13 +125,13 @@ def _print(
     quota: Quota,
     of_many: bool,
     timeout: float | None,
-    on_message: Callable[[], None],
+    silence: Silence,
 ) -> int:
     # Until Ctrl-C, the `quota`, or a silence.
     printed_s = time.monotonic()
     try:
         for sample in samples:
-            on_message()
+            silence.heard()
             whose = robot_of(str(sample.key_expr)) if of_many else ""
             if quota.take(whose):
                 print(_message_text(decoder, *encoded(sample), whose), flush=True)
@@ -144,24 +142,23 @@ def _print(
                 return Exit.OK
     except KeyboardInterrupt:
         return Exit.OK
+    silence.explain()
     return Exit.FAILURE
 
 
-def _print_rates(
-    robot: Connection, topic: str, most: int | None, on_message: Callable[[], None]
-) -> int:
+def _print_rates(robot: Connection, topic: str, most: int | None) -> int:
     # Python receives fewer than a million messages in `RATE_SPAN_S`. So the limit takes effect only
     # while the output is blocked.
     times: deque[float] = deque(maxlen=1_000_000)
-
-    def take(_: zenoh.Sample) -> None:
-        times.append(time.monotonic())
-        on_message()
-
-    subscriber = robot.listen(topic, take)
+    silence, heard_s = Silence(robot, topic), time.monotonic()
+    subscriber = robot.listen(topic, lambda _: times.append(time.monotonic()))
     try:
         for _ in itertools.count() if most is None else range(most):
             time.sleep(1.0)
+            if times and times[-1] > heard_s:
+                heard_s = times[-1]
+                silence.heard()
+            silence.look(time.monotonic() - heard_s)
             while times and time.monotonic() - times[0] > RATE_SPAN_S:
                 times.popleft()
             print(rate_text(list(times)), flush=True)

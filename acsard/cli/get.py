@@ -11,7 +11,7 @@ import sys
 
 import msgspec
 
-from acsard.cli.connection import SEVERAL_IDS, add_bus, connected_to_many, require_asked
+from acsard.cli.connection import SEVERAL_IDS, add_bus, connected_to_many, require_readable
 from acsard.cli.replies import json_line, of_robot, present_ids
 from acsard.core import formatting
 from acsard.core.formatting import printable
@@ -25,7 +25,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def main(args: argparse.Namespace) -> int:
-    require_asked(args.key)
+    require_readable(args.key, "get")
     with connected_to_many(args) as (robot, many):
         if not many:
             _show(json_line(*robot.reply(args.key)))

@@ -8,12 +8,13 @@ import argparse
 import asyncio
 import faulthandler
 import os
+import shlex
 import sys
 from importlib.util import find_spec
 from pathlib import Path
 
 from acsard.bus.zenoh_sessions import reachable
-from acsard.cli.common import add_config, add_port, load, options_text, with_record_directory
+from acsard.cli.common import add_config, add_port, load, with_record_directory
 from acsard.core.config.contradictions import warnings
 from acsard.core.config.settings import Config
 from acsard.core.values import ROOT_KEY, Event
@@ -170,7 +171,7 @@ def reach(args: argparse.Namespace) -> str:
     """Return the options with which a tool connects to this daemon, such as " --id robot2"."""
     listens = args.listen and reachable(args.listen)
     pairs = (("--config", args.config), ("--connect", listens), ("--id", args.id))
-    return options_text(pairs)
+    return "".join([f" {name} {shlex.quote(value)}" for name, value in pairs if value])
 
 
 def banner(

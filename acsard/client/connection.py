@@ -359,9 +359,14 @@ class Connection(Reads):
         state = self.get("state")
         return Pose(state.x, state.y, state.yaw)
 
-    def samples(self, name: str, timeout: float | None = None) -> Iterator[zenoh.Sample]:
-        """Yield samples of a key or wildcard below the robot's id, until a `timeout`, s."""
-        yield from Subscription(self._queue(name)).until_silence(timeout)
+    def samples(
+        self,
+        name: str,
+        timeout: float | None = None,
+        look: Callable[[float], None] | None = None,
+    ) -> Iterator[zenoh.Sample]:
+        """Yield samples of a key or wildcard, as `Subscription.until_silence` does."""
+        yield from Subscription(self._queue(name)).until_silence(timeout, look)
 
     def listen(self, name: str, callback: Callable[[zenoh.Sample], None]) -> Any:
         """Subscribe to a key. A thread of Zenoh calls `callback` with each sample.

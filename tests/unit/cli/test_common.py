@@ -10,7 +10,7 @@ import pytest
 
 from acsard.cli import parser
 from acsard.cli.common import OPTIONS, load, with_record_directory
-from acsard.cli.connection import require_asked, require_followed, robot_address
+from acsard.cli.connection import require_readable, robot_address
 from acsard.cli.run import options
 from acsard.client.connection import open_connection
 from acsard.core.config.parsing import parse
@@ -178,21 +178,17 @@ def test_a_certificate_goes_with_a_tls_endpoint_only(
 
 def test_a_key_that_does_not_exist_is_refused_with_the_near_name() -> None:
     for key in ("odom", "cmd/stranger", "cmd/app/x/y", "json/odom", "wheel_cmd/x", "*", "sim/**"):
-        require_followed(key)
+        require_readable(key, "echo")
     with pytest.raises(UsageError, match="odmo is not a key of the robot: did you mean odom"):
-        require_followed("odmo")
-
-
-# keys of another type than the program expected
+        require_readable("odmo", "echo")
 
 
 def test_published_keys_may_be_followed_and_queried() -> None:
     for key in ("odom", "state", "cmd/app/x/y"):
-        require_followed(key)
-        require_asked(key)
-    for key in ("cmd/app", "cmd/app/anna"):
-        require_followed(key)
-    require_asked("config")
+        require_readable(key, "echo")
+        require_readable(key, "get")
+    require_readable("cmd/app/anna", "echo")
+    require_readable("config", "get")
 
 
 def test_the_record_directory_is_from_the_option_the_file_or_the_service_in_this_order(

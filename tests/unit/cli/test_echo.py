@@ -108,7 +108,8 @@ def printed(robots: str, senders: str, most: int | None, timeout: float | None =
         )
         for sender in senders
     ]
-    return _print(iter(samples), None, Quota(most, robots), True, timeout, lambda: None)
+    silence: Any = SimpleNamespace(heard=lambda: None, explain=lambda: None)
+    return _print(iter(samples), None, Quota(most, robots), True, timeout, silence)
 
 
 @pytest.mark.parametrize(
@@ -213,7 +214,7 @@ def test_a_line_of_the_rate_covers_ten_seconds_of_a_fast_stream(
 
     robot: Any = SimpleNamespace(listen=listen)
     monkeypatch.setattr(echo, "time", SimpleNamespace(monotonic=lambda: now[0], sleep=sleep))
-    assert echo._print_rates(robot, "odom", 12, lambda: None) == 0
+    assert echo._print_rates(robot, "odom", 12) == 0
     last = capsys.readouterr().out.splitlines()[-1]
     assert last.startswith(" 2000.00 Hz")
     assert int(last.split()[-1]) == pytest.approx(20_000, abs=1)
