@@ -51,17 +51,18 @@ def add_options(parser: argparse.ArgumentParser) -> None:
                 action="store_true",
                 help="print every file and command, but change nothing",
             )
+        if name == "install":
             action.add_argument(
                 "--force",
                 action="store_true",
-                help="also replace or remove files that differ from those of this version",
+                help="also replace files that differ from those of this version",
             )
         if name == "uninstall":
             action.add_argument(
                 "--purge",
                 action="store_true",
                 help="also remove your configuration, certificates, systemd drop-ins, recordings "
-                "and the web page's invitations",
+                "and the page's invitations",
             )
         action.set_defaults(main=main)
 
@@ -82,11 +83,7 @@ def main_install(args: argparse.Namespace) -> int:
     python = versions.service_python()
     if python != os.path.realpath(sys.executable):
         print(f"the service runs with {python}, because it cannot run {sys.executable}")
-    files = service.files()
-    steps = service.installing(
-        files, service.present(files), service.wrong_modes(files), force=args.force
-    )
-    _do([*steps, *service.linking()], args.dry_run)
+    _do([*service.installing(service.files(), force=args.force), *service.linking()], args.dry_run)
     if not args.dry_run:
         print("\nnow set [mcu] and [robot] in /etc/acsard/acsard.toml, then type:")
         print(
@@ -97,17 +94,7 @@ def main_install(args: argparse.Namespace) -> int:
 
 def main_uninstall(args: argparse.Namespace) -> int:
     _ready(args)
-    files = [*service.files(), *map(service.lan_drop_in, service.ALL_UNITS)]
-    steps = service.uninstalling(
-        files,
-        service.present(files),
-        service.foreign_entries(files, service.config_directories()),
-        force=args.force or args.purge,
-        purge=args.purge,
-        stateful=[unit for unit, (where, _) in service.STATE_DIRECTORIES.items() if where.exists()],
-        programs=service.programs(),
-    )
-    _do(steps, args.dry_run)
+    _do(service.uninstalling(purge=args.purge), args.dry_run)
     return 0
 
 

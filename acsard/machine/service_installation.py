@@ -1,7 +1,7 @@
 """Installs acsard as a systemd service, or removes the service.
 
-The files come from `deploy/`. A file that a user has changed goes only with `force` or `purge`.
-Both are lists of steps, which the user can read before.
+The files come from `deploy/`. Both are lists of steps, which the user can read before. What stays
+after a removal, and what a purge removes, is the same as for the Debian package.
 """
 
 from __future__ import annotations
@@ -10,10 +10,9 @@ import grp
 import os
 import re
 import shutil
-import stat
 import subprocess
 import sys
-from collections.abc import Container, Iterable, Mapping
+from collections.abc import Iterable
 from pathlib import Path
 
 from msgspec import Struct
@@ -51,7 +50,7 @@ class File(Struct, frozen=True):
     path: Path
     content: bytes
     mode: int = 0o644
-    kept: bool = False  # users change it: never replaced, and if changed, removed only by a purge
+    kept: bool = False  # users change it: never replaced
 
     def current_content(self) -> bytes | None:
         """Return the content, or None if there is no file. Raises `MendableError`."""
@@ -62,39 +61,25 @@ class File(Struct, frozen=True):
         except OSError as error:
             raise _unreadable(self.path, error) from None
 
-    def is_as_written(self) -> bool:
-        """Return whether mode and owner are right, or the user's affair. Raises `OSError`."""
-        status = self.path.lstat()
-        if self.kept or stat.S_ISLNK(status.st_mode):
-            return True
-        return (stat.S_IMODE(status.st_mode), status.st_uid) == (self.mode, 0)
-
     def condition(self) -> str:
-        """Return "missing", "as installed", "changed", "wrong mode or owner" or "unreadable"."""
+        """Return "missing", "as installed", "changed" or "unreadable"."""
         try:
             content = self.current_content()
         except MendableError:
             return "unreadable"
         if content is None:
             return "missing"
-        if content != self.content:
-            return "changed"
-        return "as installed" if self.is_as_written() else WRONG_MODE
-
-
-WRONG_MODE = "wrong mode or owner"
+        return "as installed" if content == self.content else "changed"
 
 
 class Write(Struct, frozen=True):
-    """Writes a file, for the reason `why`."""
+    """Writes a file with its mode, owned by this user."""
 
     file: File
-    why: str = ""
 
     def __str__(self) -> str:
-        why = f"; {self.why}" if self.why else ""
         size, mode = len(self.file.content), self.file.mode
-        return f"write   {self.file.path}  ({size} bytes, mode {mode:o}{why})"
+        return f"write   {self.file.path}  ({size} bytes, mode {mode:o})"
 
     def do(self) -> None:
         # Every user may enter new directories.
@@ -120,19 +105,10 @@ class Remove(Struct, frozen=True):
         return self.path.is_dir() and not self.path.is_symlink()
 
     def do(self) -> None:
-        # acsard's own directories are deleted when they become empty.
         if self._is_directory:
             shutil.rmtree(self.path)
         else:
             self.path.unlink()
-        for place in self.path.parents:
-            if place.name not in OWN_DIRECTORIES:
-                return
-            try:
-                place.rmdir()
-            except OSError:
-                # The directory still contains other files.
-                return
 
 
 class Keep(Struct, frozen=True):
@@ -203,8 +179,6 @@ def _unreadable(path: Path, error: OSError) -> MendableError:
 
 UNIT, GATEWAY, PAGE = "acsard.service", "acsard-gateway.service", "acsard-web.service"
 ALL_UNITS = (UNIT, GATEWAY, PAGE)
-# Removed when they become empty.
-OWN_DIRECTORIES = ("acsard", *(f"{unit}.d" for unit in ALL_UNITS))
 UNIT_DIRECTORY, PACKAGE_UNIT_DIRECTORY = (
     Path("/etc/systemd/system"),
     Path("/usr/lib/systemd/system"),
@@ -215,16 +189,15 @@ LAN_DROP_IN = "lan.conf"
 COMMAND = Path("/usr/local/bin/acsard")  # in the PATH of every user, also under sudo
 PROGRAM = versions.HOME / versions.CURRENT / "bin" / "acsard"
 TLS_DIRECTORY = "/etc/acsard/tls"  # in the drop-in `lan.conf`
-# Directories by unit, with their content.
-STATE_DIRECTORIES = {
-    UNIT: (
-        Path("/var/lib/acsard"),
-        "the daemon's recordings, and the stop that survives a restart",
-    ),
-    PAGE: (Path("/var/lib/acsard-web"), "invitations to the page"),
+# What a user may miss, with its content.
+KEPT_BY_REMOVAL = {
+    CONFIG_DIRECTORY: "your configuration and certificates",
+    **{UNIT_DIRECTORY / f"{unit}.d": "your drop-ins" for unit in ALL_UNITS},
+    Path("/var/lib/acsard"): "recordings, and the stop that survives a restart",
+    Path("/var/lib/acsard-web"): "invitations to the page",
 }
-
-Found = Mapping[Path, bytes | None]  # by path; None without a file
+# What the directories of the state of a service with a dynamic user are links to.
+PRIVATE = Path("/var/lib/private/acsard"), Path("/var/lib/private/acsard-web")
 
 RELOAD_COMMANDS = (
     Run(("systemctl", "daemon-reload")),
@@ -305,40 +278,26 @@ def admitted(file: File, content: bytes | None, directory: Path) -> Write | Keep
     return Write(File(file.path, text))
 
 
-def present(wanted: Iterable[File]) -> dict[Path, bytes | None]:
-    """Return the present contents by path. Raises `MendableError`."""
-    return {file.path: file.current_content() for file in wanted}
+def installing(wanted: Iterable[File], *, force: bool) -> list[Step]:
+    """Return the steps that install the service. The first configuration is never replaced.
 
-
-def wrong_modes(wanted: Iterable[File]) -> set[Path]:
-    """Return the paths of the existing files in `wanted` whose mode or owner is wrong."""
-    return {file.path for file in wanted if file.path.exists() and not file.is_as_written()}
-
-
-def installing(
-    wanted: Iterable[File], contents: Found, wrong: Container[Path], *, force: bool
-) -> list[Step]:
-    """Return the steps that install the service, with files in `wrong` modes again.
-
-    Files with `kept` stay. Others that differ are overwritten by `force`, or raise `MendableError`.
+    Raises `MendableError` if another file differs, unless `force` overwrites it.
     """
-    steps: list[Step] = []
-    changed: list[str] = []
-    for file in wanted:
-        there = contents[file.path]
-        same = there == file.content
-        if (same and file.path not in wrong) or (file.kept and there is not None):
-            steps.append(Keep(file.path))
-            continue
-        if there is not None and not same:
-            changed.append(str(file.path))
-        steps.append(Write(file, f"it has a {WRONG_MODE}" if same else ""))
+    there = {file: file.current_content() for file in wanted}
+    changed = [
+        str(file.path)
+        for file, content in there.items()
+        if content not in (None, file.content) and not file.kept
+    ]
     if changed and not force:
-        paths = ", ".join(changed)
         raise MendableError(
             "these files differ from the files that this version of acsard installs: "
-            f"{paths}; look at the differences, and replace the files with --force"
+            f"{', '.join(changed)}; look at the differences, and replace the files with --force"
         )
+    steps: list[Step] = [
+        Keep(file.path) if file.kept and content is not None else Write(file)
+        for file, content in there.items()
+    ]
     return [InstallCopy(), *steps, *INSTALL_COMMANDS]
 
 
@@ -347,85 +306,21 @@ def linking() -> list[Step]:
     return [] if os.path.lexists(COMMAND) else [Link(COMMAND, PROGRAM)]
 
 
-def config_directories() -> list[Path]:
-    """Return the directories of the service in /etc, which may also contain the user's files."""
-    return [*(UNIT_DIRECTORY / f"{unit}.d" for unit in reversed(ALL_UNITS)), CONFIG_DIRECTORY]
-
-
-def foreign_entries(files: Iterable[File], places: Iterable[Path]) -> list[Path]:
-    """Return the entries of the directories `places` that are not files of the installation."""
-    ours = {file.path for file in files}
-    inside = (path for place in places if place.is_dir() for path in sorted(place.iterdir()))
-    return [path for path in inside if path not in ours]
-
-
-def uninstalling(
-    wanted: Iterable[File],
-    contents: Found,
-    others: Iterable[Path] = (),
-    *,
-    force: bool,
-    purge: bool = False,
-    stateful: Iterable[str] = (),
-    programs: Iterable[Path] = (),
-) -> list[Step]:
-    """Return the steps that remove the service, with a `Keep` for all that stays.
-
-    Changed files go with `force`, unless they are `kept`. `purge` removes everything, with `others`
-    and the directories of `stateful` units, which it may have to install again: only systemd can
-    remove them.
-    """
-    wanted, stateful = list(wanted), list(stateful)
-    # Only systemd knows the real path of a state directory, and only while the unit is installed.
-    # So if an earlier removal has kept the directory without its unit, install the unit again.
-    again = [
-        file
-        for file in wanted
-        if purge and file.path.name in stateful and contents[file.path] is None
-    ]
-    there = [file for file in wanted if contents[file.path] is not None or file in again]
-    why: dict[Path, str] = {}
-    for file in there:
-        if contents[file.path] == file.content or purge:
-            continue
-        if file.kept:
-            why[file.path] = "it is your configuration; --purge removes it"
-        elif not force:
-            why[file.path] = "the file differs from what this version installs; --force removes it"
-    steps: list[Step] = [
-        Keep(file.path, why[file.path]) if file.path in why else Remove(file.path) for file in there
-    ]
-    for path in others:
-        what = (
-            "certificates and their authority"
-            if path == Path(TLS_DIRECTORY)
-            else "not a file of the service"
-        )
-        steps.append(Remove(path) if purge else Keep(path, f"{what}; --purge removes it"))
-    for unit in stateful:
-        where, what = STATE_DIRECTORIES[unit]
-        clean = Run(("systemctl", "clean", "--what=state", unit))
-        steps.insert(0, clean if purge else Keep(where, f"{what}; --purge removes it"))
-    units = [name for name in reversed(ALL_UNITS) if any(file.path.name == name for file in there)]
-    leaving = [Run(("systemctl", "disable", "--now", *units))] if units else []
-    back: list[Step] = [*map(Write, again), RELOAD_COMMANDS[0]] if again else []
-    removed: list[Step] = []
-    for path in programs:
-        # If a unit stays, the daemon may start again, and needs its program and `acsard-stop`.
-        stays = [file.name for file in why if file.name in ALL_UNITS]
-        removed.append(
-            Keep(path, f"{stays[0]} stays and needs this directory") if stays else Remove(path)
-        )
-    return [*back, *leaving, *steps, *REMOVE_COMMANDS, *removed]
-
-
-def programs() -> list[Path]:
-    """Return the copies and links that the installation has made."""
-    links = (versions.CURRENT, versions.PREVIOUS)
+def uninstalling(*, purge: bool) -> list[Step]:
+    """Return the steps that remove the service, with a `Keep` for all that only `purge` removes."""
+    units = [unit for unit in reversed(ALL_UNITS) if (UNIT_DIRECTORY / unit).exists()]
+    steps: list[Step] = [Run(("systemctl", "disable", "--now", *units))] if units else []
+    steps += [Remove(path) for path in (*(UNIT_DIRECTORY / unit for unit in units), RULES)]
+    if purge:
+        steps += map(Remove, (*KEPT_BY_REMOVAL, *PRIVATE))
+    else:
+        steps += [
+            Keep(path, f"{what}; --purge removes it") for path, what in KEPT_BY_REMOVAL.items()
+        ]
+    programs = [COMMAND] if COMMAND.is_symlink() and COMMAND.readlink() == PROGRAM else []
+    steps += [*REMOVE_COMMANDS, *map(Remove, (*programs, versions.HOME))]
     return [
-        *([COMMAND] if COMMAND.is_symlink() and COMMAND.readlink() == PROGRAM else ()),
-        *(versions.HOME / name for name in links if (versions.HOME / name).is_symlink()),
-        *(versions.HOME / name for name in versions.installed()),
+        step for step in steps if not isinstance(step, Keep | Remove) or os.path.lexists(step.path)
     ]
 
 
