@@ -7,12 +7,13 @@ import math
 import os
 import sys
 from collections.abc import Callable, Mapping, Sequence
+from typing import get_args
 
 from msgspec.structs import replace
 
 from acsard.core.config import parsing as configuration
 from acsard.core.config.parsing import ConfigError
-from acsard.core.config.settings import RECORD_VARIABLE, Config
+from acsard.core.config.settings import RECORD_VARIABLE, AngularSpeed, Config, LinearSpeed
 from acsard.core.formatting import many
 from acsard.host.config_file import find
 from acsard.host.errors import Exit, ExitError
@@ -43,6 +44,22 @@ def add_outcome(parser: argparse.ArgumentParser, result: str) -> None:
         help=f"also write {result} into the configuration file and keep its comments (needs the "
         "extra `tools`)",
     )
+
+
+def add_speeds(
+    parser: argparse.ArgumentParser, linear: float, angular: float, least: float, meaning: str
+) -> None:
+    """Add --linear and --angular with these defaults, from `least` to what the daemon takes."""
+    for name, speed, kind in (("linear", linear, LinearSpeed), ("angular", angular, AngularSpeed)):
+        meta = get_args(kind)[1]
+        unit = meta.extra["unit"]
+        parser.add_argument(
+            f"--{name}",
+            type=between(least, meta.le, unit),
+            default=speed,
+            metavar=unit.upper(),
+            help=f"{meaning}, from {least:g} to {meta.le:g} {unit} (default: %(default)s)",
+        )
 
 
 def between(least: float, most: float, units: str) -> Callable[[str], float]:

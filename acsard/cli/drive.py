@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import argparse
 import sys
-from typing import get_args
 
-from acsard.cli.common import between
+from acsard.cli.common import add_speeds
 from acsard.cli.connection import add_bus, connected, require_one
-from acsard.core.config.settings import AngularSpeed, LinearSpeed
 from acsard.core.messages.permissions import COMMAND_ROLE, has
 from acsard.host.errors import NoAnswerError, NotPermittedError, UsageError
 from acsard.host.logs import MAX_LAST_OUTPUT_S, output_in_threads
@@ -21,17 +19,7 @@ from acsard.top.keyboard import Keyboard, KeyboardDrive
 def add_options(parser: argparse.ArgumentParser) -> None:
     parser.epilog = "\n".join(HELP)
     parser.formatter_class = argparse.RawDescriptionHelpFormatter
-    for name, speed, setting in (("--linear", 0.5, LinearSpeed), ("--angular", 1.0, AngularSpeed)):
-        _, meta = get_args(setting)
-        unit = meta.extra["unit"]
-        parser.add_argument(
-            name,
-            type=between(meta.ge, meta.le, unit),
-            default=speed,
-            metavar=unit.upper(),
-            help=f"speed at the start, from {meta.ge:g} to {meta.le:g} {unit}; keys change it "
-            "during the drive (default: %(default)s)",
-        )
+    add_speeds(parser, 0.5, 1.0, 0.0, "speed at the start, which keys change during the drive")
     parser.add_argument(
         "--source",
         default="teleop",

@@ -6,12 +6,10 @@ exit code is 1 if the robot does not follow, comes no nearer to the end for 3 s,
 from __future__ import annotations
 
 import argparse
-from typing import get_args
 
-from acsard.cli.common import between
+from acsard.cli.common import add_speeds, between
 from acsard.cli.connection import add_bus, connected
 from acsard.client import Client
-from acsard.core.config.settings import AngularSpeed, LinearSpeed
 from acsard.core.messages.short_texts import place
 from acsard.host.errors import UsageError
 
@@ -27,16 +25,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         help="forward METRES, back METRES, left DEGREES or right DEGREES; several are driven one "
         "after the other",
     )
-    for name, speed, setting in (("--linear", 0.3, LinearSpeed), ("--angular", 0.8, AngularSpeed)):
-        _, meta = get_args(setting)
-        unit = meta.extra["unit"]
-        parser.add_argument(
-            name,
-            type=between(0.02, meta.le, unit),
-            default=speed,
-            metavar=unit.upper(),
-            help=f"highest speed, up to {meta.le:g} {unit} (default: %(default)s)",
-        )
+    add_speeds(parser, 0.3, 0.8, 0.02, "highest speed")
     parser.add_argument(
         "--source", default="app", help="send the commands as this command source (default: app)"
     )

@@ -123,7 +123,18 @@ def add_options(parser: argparse.ArgumentParser) -> None:
             help="file to write (default: named after the recording, in the working directory)",
         )
         action.add_argument("--force", action="store_true", help="overwrite an existing file")
-    _export_forms(exported)
+    form = exported.add_mutually_exclusive_group()
+    for kind, text in (
+        (
+            "csv",
+            "write a CSV table with one row per feedback line; its first columns are those that "
+            "`acsard calibrate log` reads",
+        ),
+        ("rosbag2", "write a directory with metadata.yaml, as `ros2 bag` does"),
+    ):
+        form.add_argument(
+            f"--{kind}", dest="kind", action="store_const", const=kind, default="mcap", help=text
+        )
     for action in (replay, exported):
         action.add_argument(
             "--config",
@@ -147,26 +158,6 @@ def _selection(parser: argparse.ArgumentParser, default: object) -> None:
             metavar="TIME",
             help=f"for example {TIME_EXAMPLES}{more}",
         )
-
-
-def _export_forms(parser: argparse.ArgumentParser) -> None:
-    form = parser.add_mutually_exclusive_group()
-    form.add_argument(
-        "--csv",
-        dest="kind",
-        action="store_const",
-        const="csv",
-        default="mcap",
-        help="write a CSV table with one row per feedback line; its first columns are those that "
-        "`acsard calibrate log` reads",
-    )
-    form.add_argument(
-        "--rosbag2",
-        dest="kind",
-        action="store_const",
-        const="rosbag2",
-        help="write a directory with metadata.yaml, as `ros2 bag` does",
-    )
 
 
 def main(args: argparse.Namespace) -> int:
