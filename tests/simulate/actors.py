@@ -406,6 +406,7 @@ class Run:
                     witness.cleared(true_ns, read_ns, text, event["by"])
                 case "activate":
                     witness.activated(true_ns, read_ns, event["by"])
+                    self.reasons.restart()
                 case "deactivate":
                     witness.offs.append(true_ns)
                 case "set":

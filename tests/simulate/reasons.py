@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from tests.simulate.ages import MARGIN_NS
+from tests.simulate.ages import HOUR_NS, MARGIN_NS
 from tests.simulate.promises import BrokenError
 from tests.simulate.roads import FOREIGN, NS, Message, Sample
 
@@ -36,13 +36,10 @@ EVERY_NS = NS // 5
 STEADY_NS = 15_000_000
 """Range of the true delays of a sender whose commands are certainly never late."""
 
-PAUSE_NS = 19 * NS // 10
-"""After a silence of this length a proof that was not over may begin again."""
-
 PROOF = 10
 """Number of commands after which a proof through jitter is certainly over."""
 
-FORGOTTEN_NS = 200 * NS
+FORGOTTEN_NS = HOUR_NS - NS
 """After a silence of this length a clock may be new again."""
 
 
@@ -69,15 +66,16 @@ class _Clock:
         return not self.odd and self.most_ns - self.least_ns <= STEADY_NS
 
     def is_proved(self, at_ns: int, timeout_ns: int) -> bool:
-        """Return whether the daemon certainly had proved this clock's delays at this time."""
-        lasted = at_ns - self.first_ns
-        return self.steady and lasted > 5 * min(timeout_ns, 2 * NS) + NS and self.count >= PROOF
+        """Return whether the daemon certainly had proved this clock's delays at this time.
+
+        Only commands prove them: the time since the last one does not count.
+        """
+        lasted = min(at_ns, self.last_ns) - self.first_ns
+        return self.steady and lasted > 5 * timeout_ns + NS and self.count >= PROOF
 
     def may_be_known(self, at_ns: int, timeout_ns: int) -> bool:
         """Return whether the daemon may have proved this clock's delays at this time."""
-        return (
-            self.odd or self.unsure or at_ns - self.first_ns > min(timeout_ns, 2 * NS) - MARGIN_NS
-        )
+        return self.odd or self.unsure or at_ns - self.first_ns > timeout_ns - MARGIN_NS
 
 
 class _LastMessage:
@@ -119,7 +117,7 @@ class Reasons:
         self.restart()
 
     def restart(self, stood: bool = False) -> None:
-        """Forget all senders, because a daemon starts, or because the robot slept (`stood`).
+        """Forget all senders: a daemon starts, has executed `activate`, or slept (`stood`).
 
         After a sleep the daemon still remembers the old delays, so all delays look changed to it.
         """
@@ -181,7 +179,7 @@ class Reasons:
             clock = self._clocks[name] = _Clock(at_ns, delay_ns)
             clock.unsure = name in self._known_before
         silent_ns = at_ns - clock.last_ns
-        if silent_ns > FORGOTTEN_NS or (silent_ns > PAUSE_NS and not clock.proved):
+        if silent_ns > FORGOTTEN_NS:
             # Its proof may begin again, unless it was over.
             clock.first_ns, clock.unsure, clock.proved, clock.count = at_ns, True, False, 0
         clock.last_ns = at_ns
