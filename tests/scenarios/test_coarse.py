@@ -8,7 +8,7 @@ from contextlib import nullcontext
 
 import pytest
 
-from acsard.core.config.settings import Config, McuConfig, SimConfig
+from acsard.core.config.settings import Config, ControlConfig, McuConfig, SimConfig
 from tests.scenarios.world import World
 
 
@@ -68,3 +68,17 @@ def test_a_robot_whose_wheels_respond_late_brakes_without_a_fault(
         world.drive(1.0, seconds=1.5 + 0.017 * at)
         world.hold(0.0, 0.0, 1.5)
     assert world.state.mode == "driving"
+
+
+@pytest.mark.parametrize("configured", [True, False])
+def test_counts_are_not_counted_twice_in_lines_that_are_faster_than_the_firmware_counts(
+    configured: bool,
+) -> None:
+    mcu = McuConfig(encoder_counts=400 * configured)
+    control = ControlConfig(rate=200.0)
+    world = World(Config(control=control, mcu=mcu, sim=SimConfig(encoder_counts=400)))
+    world.run(1.024)
+    for linear, angular in ((0.0, 0.0), (0.2, 1.5), (0.0, 0.0)):
+        world.drive(linear, angular, 4.0)
+    turned = world.mcu.vehicle.pose.yaw - world.state.yaw
+    assert abs(math.remainder(turned, math.tau)) < 0.03

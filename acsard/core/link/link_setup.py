@@ -15,6 +15,10 @@ from acsard.core.link.checked_line import SAMPLE_REQUEST
 from acsard.core.link.codec import Codec
 from acsard.core.values import NS_PER_S, Ns
 
+# Firmware counts for 4 ms and more, and repeats its speeds meanwhile. Nobody knows which of more
+# frequent replies do so: whole counts would be counted twice.
+LEAST_APART_NS = 9_000_000
+
 LATE_STEP_FRACTION = 0.5  # of `quiet_ns`, between two steps: the second is late
 
 
@@ -30,6 +34,7 @@ class LinkSetup(Struct, frozen=True):
     quiet_ns: Ns  # silence after which the link is stale
     late_step_ns: float  # time between two steps that makes the second late
     count: float  # rad of one encoder count; 0 if unknown
+    shows_counts: bool  # speeds of plain lines show whole counts
     fastest: float  # counts per ms at `feedback.wheel_speed`
     encoders: bool  # `feedback.encoders`
     longest_reply: float  # highest value that `mcu.reply_period` may have, s
@@ -44,6 +49,7 @@ class LinkSetup(Struct, frozen=True):
     ) -> LinkSetup:
         codec, counts = Codec(mcu.wheels, mcu.trailing_comma), mcu.encoder_counts
         quiet_ns = int(NS_PER_S * max(0.1, 4 / rate_hz, 3 * mcu.reply_period))
+        apart_ns = round(NS_PER_S / rate_hz)
         return cls(
             mcu,
             codec,
@@ -51,11 +57,12 @@ class LinkSetup(Struct, frozen=True):
             letters=SAMPLE_REQUEST if mcu.wants_samples else b"",
             rest=codec.stop.rstrip(b",\r\n"),
             period_ns=0 if mcu.checked else round(NS_PER_S * mcu.reply_period),
-            apart_ns=round(NS_PER_S / rate_hz),
+            apart_ns=apart_ns,
             soonest_ns=wire_ns(2 * PLAIN_BYTES, mcu.baud_rate),
             quiet_ns=quiet_ns,
             late_step_ns=LATE_STEP_FRACTION * quiet_ns,
             count=math.tau / counts if counts else 0.0,
+            shows_counts=mcu.reply_period > 0.0 or apart_ns >= LEAST_APART_NS,
             fastest=feedback.wheel_speed / math.tau * counts / 1000,
             encoders=feedback.encoders,
             longest_reply=longest_reply,

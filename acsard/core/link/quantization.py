@@ -115,15 +115,16 @@ class CountRecovery(Struct):
         """Return the configured counts per turn; all 0 if the speeds contradict them."""
         return (configured if self.whole.doubt < MAX_DOUBT else 0,) * 4
 
-    def recover_counts(self, line: Feedback, angle: Rad) -> Feedback:
+    def recover_counts(self, line: Feedback, angle: Rad, shown: bool = True) -> Feedback:
         """Return a good line with `counted`, `steps` and `count`.
 
-        `angle` is that of one count, rad, or 0 if the counts are not configured. If the counts
-        include the motion of a missing line before it, `bridged` becomes 0.
+        `angle` is that of one count, rad, or 0 if the counts are not configured; `shown`: the
+        speeds show whole counts. If these include the motion of a missing line before it, `bridged`
+        becomes 0.
         """
         elapsed_s, speeds, counted = line.dt - line.bridged, line.speeds.as_tuple(), None
         if angle:
-            if line.turned is None and elapsed_s > 0.0:
+            if line.turned is None and elapsed_s > 0.0 and shown:
                 counted = self.whole.turned(angle, speeds, elapsed_s, line.jitter, line.bridged)
                 if self.whole.covers_gap:
                     line = replace(line, bridged=0.0)
