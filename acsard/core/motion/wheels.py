@@ -112,7 +112,7 @@ class Wheel(Struct):
     agrees: bool = True
     approaches: bool = False  # in the last block
     apart_s: Seconds = 0.0  # since it came nearer to its command
-    apart_angle: Rad = 0.0  # that it rolled since then
+    apart_angle: Rad = 0.0  # that it rolled since then, beyond its command
     speed_then: RadPerS = 0.0  # when it did
     command_then: RadPerS = 0.0
     reacts: bool = False  # it came nearer since the command last moved away from it
@@ -377,16 +377,18 @@ class Wheels(Struct):
         if self._are_swapped(i):
             return
         goes_on = angle * off > 0.0 and speed * off > 0.0
+        beyond = abs(wheel.apart_angle)
         if goes_on and abs(command) < COMMANDED:
             # A firmware that waits for the next count keeps the last speed of a wheel that stops:
             # it followed the command until the last two counts, and never changes after them.
             kept = wheel.ignored_s <= max(MAX_BLOCK_S, 2 * count / abs(speed))
             # A sound wheel comes to rest before it has rolled this far without an approach.
-            far = abs(wheel.apart_angle) >= max(FAULT_ANGLE, FAULT_COUNTS * count)
+            far = beyond >= max(FAULT_ANGLE, FAULT_COUNTS * count)
             if far and not (kept and wheel.same_s >= wheel.apart_s):
                 self._latch("wheel_runaway", i, command)
         elif goes_on and off * command > 0.0:
-            if abs(speed) > abs(command):
+            # A sound wheel is at its command before its smoothed speed, the mean of some counts.
+            if beyond >= count and abs(speed) > abs(command):
                 self._latch("wheel_runaway", i, command)
         elif goes_on and abs(speed) >= AGREEMENT * abs(command):
             self._latch("wheel_reversed", i, command)
@@ -601,7 +603,7 @@ def _follow(wheel: Wheel, angle: Rad, due: Rad, block: Block) -> None:
         wheel.apart_s, wheel.apart_angle, wheel.speed_then, wheel.reacts = 0.0, 0.0, speed, True
     else:
         wheel.apart_s += s
-        wheel.apart_angle += angle
+        wheel.apart_angle += angle - command * s
         if nearer < 0.0 and not wheel.reacts:
             wheel.speed_then = speed  # the worst one counts
 
