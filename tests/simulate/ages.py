@@ -29,7 +29,7 @@ HOUR_NS = 3600 * NS
 """The least delay may rise by one timeout in this time. A clock that was silent for it is new."""
 
 REMEMBERED = 16
-"""Clocks of one source that the robot remembers."""
+"""Clocks of one source that the robot remembers, first those that it uses."""
 
 
 class Wish:
@@ -73,6 +73,8 @@ class Clock:
         """Times and delays of all commands since the first one below the least, if all are."""
         self._confirmed_ns = math.inf
         """The lowest value that such commands may have given to the robot's least delay."""
+        self.known: Clock | None = None
+        """The same clock if the robot has not forgotten it for others."""
 
     def take(self, at_ns: int, delay_ns: int, timeout_ns: int) -> bool:
         """Return whether a command with this delay may count."""
@@ -120,7 +122,7 @@ class Ages:
         """Note that the robot slept until now, so it no longer knows any least delay."""
         self.learned_ns = at_ns
         for clock in self._clocks.values():
-            clock.least = None
+            clock.least = clock.known = None
 
     def fresh(
         self,
@@ -137,13 +139,15 @@ class Ages:
             return True
         key, delay_ns = (sender["source"], sample.clock), arrived_ns - message.stamp_ns
         clock, others = self._clocks.get(key), self._number.get(sender["source"], 0)
-        if clock is not None:
-            silent = arrived_ns - clock.last_ns > HOUR_NS - NS
-            if silent or others - clock.others > REMEMBERED:
-                clock = None
-        if clock is None:
-            self._number[sender["source"]] = others + 1
-            self._clocks[key] = Clock(arrived_ns, delay_ns, others + 1)
-            return timeout_ns < MARGIN_NS
-        clock.others = others
-        return clock.take(arrived_ns, delay_ns, timeout_ns)
+        if clock is not None and arrived_ns - clock.last_ns > HOUR_NS - NS:
+            clock = None
+        if clock is None or others - clock.others > REMEMBERED:
+            others = self._number[sender["source"]] = others + 1
+            new = self._clocks[key] = Clock(arrived_ns, delay_ns, others)
+            new.known = clock and (clock.known or clock)
+            fresh = timeout_ns < MARGIN_NS
+        else:
+            new, fresh = clock, clock.take(arrived_ns, delay_ns, timeout_ns)
+        new.others = others
+        known = new.known is not None and new.known.take(arrived_ns, delay_ns, timeout_ns)
+        return fresh or known
