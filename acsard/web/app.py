@@ -11,7 +11,6 @@ import socket
 from collections.abc import Mapping
 from collections.abc import Set as AbstractSet
 from typing import Annotated, Any
-from urllib.parse import parse_qsl
 
 import msgspec
 from aiohttp import web
@@ -34,7 +33,7 @@ from acsard.web.callers import PROTOCOL, RequestRefusedError, cookie_name, token
 from acsard.web.camera import Camera
 from acsard.web.connections import Connections
 from acsard.web.recordings import BlackBox, Recording
-from acsard.web.routes import FORM, JSON, RECORDINGS_ROLE, Body, Problem, Route, services, values
+from acsard.web.routes import JSON, RECORDINGS_ROLE, Body, Problem, Route, services, values
 from acsard.web.socket_messages import MAX_MESSAGE_BYTES
 from acsard.web.streams import as_json
 from acsard.web.tokens import ReadTokens
@@ -301,19 +300,10 @@ async def _arguments_in(request: web.Request) -> dict[str, Any]:
 
 
 async def _token_posted(request: web.Request) -> TokenForm:
-    body = await _body_of(request)
     try:
-        text = body.decode(request.charset or "utf-8")
-        if request.content_type == JSON:
-            return msgspec.json.decode(text, type=TokenForm)
-        if request.content_type == FORM:
-            fields = dict(parse_qsl(text, errors="strict", max_num_fields=10))
-            return msgspec.convert(fields, TokenForm, strict=False)
-    except (msgspec.MsgspecError, ValueError, LookupError, RecursionError):
-        pass
-    raise RequestRefusedError(
-        "malformed", "send the token in UTF-8, either as a form (token=...) or as JSON"
-    )
+        return msgspec.json.decode(await _body_of(request), type=TokenForm)
+    except (msgspec.MsgspecError, ValueError, RecursionError):
+        raise RequestRefusedError("malformed", "send the token as JSON") from None
 
 
 def _limit_buffer(request: web.Request) -> None:
@@ -329,7 +319,7 @@ ROUTES: tuple[Route, ...] = (
     Route("GET", "/page/{name}", None, Page.file),
     Route("POST", "/token", None, Page.token,
         "exchanges a token for a cookie that no script can read; only over HTTPS",
-        takes=TokenForm, forms=(JSON, FORM),
+        takes=TokenForm,
         gives={303: Body("The token is valid. The header `Location` leads to the page.", media=""),
                409: Body("The browser has a cookie with more permissions; `replace` overwrites it.",
                          Problem)}),

@@ -1,4 +1,5 @@
-"""Connects to the daemon of the page's robot, follows the robot's state, and detects silence.
+"""Connects to the daemon of the page's robot, follows its state and the keys of the viewers, and
+detects silence.
 
 This work has a thread of its own, which may wait for the bus. The event loop reads its results.
 """
@@ -27,9 +28,12 @@ from acsard.host import clock
 from acsard.host.errors import MendableError, UnreachableError
 from acsard.host.threads import in_thread
 from acsard.web.metrics import Counts
-from acsard.web.streams import RETRY_DELAY_S, Streams
+from acsard.web.streams import Streams
 
-PROCESS_PERIOD_S = 0.1
+PROCESS_PERIOD_S = 0.05
+
+# After a failed attempt to connect.
+RETRY_DELAY_S = 1.0
 
 # Between two queries of `About`: after an answer, and after none.
 ABOUT_PERIOD_S, ABOUT_RETRY_S = 10.0, 1.0
@@ -93,7 +97,7 @@ class FollowedRobot:
         self.certificate = shown_at(address.endpoint, address.tls)
         self.about = about
         self.client: Connection | None = None
-        self.streams = Streams(lambda: self.client)
+        self.streams = Streams()
         # why the robot is not reachable, or ""
         self.gone = f"no daemon answers at {address.endpoint} yet"
         self.state: RobotState | None = None  # the newest one
@@ -121,6 +125,7 @@ class FollowedRobot:
                 time.sleep(RETRY_DELAY_S)
         watch = Watch(self.client, clock.steady_s())
         while not self._is_leaving:
+            self.streams.update(self.client)
             self._look(watch, clock.steady_s())
             if not self.gone and clock.steady_s() >= self._about_due_s:
                 self._about_due_s = clock.steady_s() + ABOUT_PERIOD_S

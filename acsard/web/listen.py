@@ -74,7 +74,6 @@ def invitations(listen: Sequence[Listen], tls: str) -> list[str]:
     `require_certificate` first; `tls` is the directory of the certificate.
     """
     urls: list[str] = []
-    ipv4_ports = _ipv4_ports(listen)
     for address in listen:
         if not address.secure:
             continue
@@ -82,12 +81,9 @@ def invitations(listen: Sequence[Listen], tls: str) -> list[str]:
         if address.everywhere:
             certified = names_in(tls)
             own = [at for at in own_addresses() if at in certified]
-            # Not every network has IPv6, so IPv4 addresses come first. A socket at `::` does not
-            # accept IPv4 connections if another socket has the same port on IPv4.
-            both = address.host != EVERYWHERE_6 or address.port not in ipv4_ports
-            older = [at for at in own if ":" not in at and both]
+            # Not every network has IPv6, so IPv4 addresses come first.
             newer = [at for at in own if ":" in at and address.host == EVERYWHERE_6]
-            hosts = [*older, *newer, own_name()]
+            hosts = [*(at for at in own if ":" not in at), *newer, own_name()]
         urls += [address.url_at(host) for host in hosts]
     return list(dict.fromkeys(urls))
 
@@ -114,17 +110,12 @@ def open_sockets(listen: Sequence[Listen], next_port: bool) -> list[tuple[Listen
 
     If `next_port` is true, the next free port of `MAX_PORTS_TRIED` is used. Raises `InUseError`.
     """
-    ipv4_ports = _ipv4_ports(listen)
-    return [_open_socket(address, next_port, address.port not in ipv4_ports) for address in listen]
+    return [_open_socket(address, next_port) for address in listen]
 
 
-def _ipv4_ports(listen: Sequence[Listen]) -> set[int]:
-    return {address.port for address in listen if ":" not in address.host}
-
-
-def _open_socket(addr: Listen, next_port: bool, both: bool) -> tuple[Listen, socket.socket]:
+def _open_socket(addr: Listen, next_port: bool) -> tuple[Listen, socket.socket]:
     ports = range(addr.port, min(65536, addr.port + MAX_PORTS_TRIED)) if next_port else [addr.port]
-    both = both and addr.host == EVERYWHERE_6 and socket.has_dualstack_ipv6()
+    both = addr.host == EVERYWHERE_6 and socket.has_dualstack_ipv6()
     trouble: OSError | None = None
     for port in ports:
         try:

@@ -16,7 +16,7 @@ from acsard.core.messages.json_schema import SCHEMAS
 from acsard.core.messages.keys_and_roles import FOLLOWED
 from acsard.core.messages.schema import Beat
 from acsard.web import socket_messages
-from acsard.web.routes import Body, Problem, Route
+from acsard.web.routes import JSON, Body, Problem, Route
 from acsard.web.socket_messages import MESSAGE_TYPES
 
 Described = dict[str, Any]
@@ -125,7 +125,7 @@ def _operation(row: Route, refs: Refs) -> Described:
             for name in row.parameters
         ]
     if row.takes is not None:
-        content = {media: {"schema": _schema(row.takes, refs)} for media in row.forms}
+        content = {JSON: {"schema": _schema(row.takes, refs)}}
         operation["requestBody"] = {"required": _needed(row.takes), "content": content}
     if 101 in row.gives:
         operation["x-messages"] = {"to": _ref(TO_ROBOT), "from": _ref(FROM_ROBOT)}

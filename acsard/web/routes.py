@@ -29,7 +29,7 @@ Handler = Callable[[Any, Any], Awaitable[Any]]
 
 RECORDINGS_ROLE: Role = "operator"
 
-JSON, FORM = "application/json", "application/x-www-form-urlencoded"
+JSON = "application/json"
 
 # A path parameter with another name matches any text without a slash.
 PARAMETERS = {"type": "[A-Za-z0-9_]{1,80}", "verb": SERVICE_NAME.pattern}
@@ -61,7 +61,6 @@ class Route(Struct, frozen=True):
     handler: Handler
     summary: str = ""  # "": not in the OpenAPI document
     takes: type | str | None = None  # type, or name of a bus message in `SCHEMAS`
-    forms: tuple[str, ...] = (JSON,)  # media types of the body
     gives: Mapping[int, Body] = {}  # by HTTP status; any other one gives a `Problem`
     # A stop is answered even if its token has too many connections or requests.
     always: bool = False

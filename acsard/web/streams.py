@@ -6,7 +6,6 @@ when the first viewer needs it, and only once for all viewers.
 
 from __future__ import annotations
 
-import asyncio
 import threading
 from collections.abc import Callable
 from contextlib import suppress
@@ -20,20 +19,11 @@ from acsard.client.connection import Connection
 from acsard.core.messages.encodings import DecodeError, detect
 from acsard.core.messages.keys_and_roles import FOLLOWED
 from acsard.host import clock
-from acsard.host.errors import UsageError
-from acsard.host.threads import in_thread
+from acsard.host.errors import NoAnswerError
 
 Take = Callable[[zenoh.Sample], None]
 
 VIEWER_KEYS = frozenset(topic.key for topic in FOLLOWED)
-
-DECLARE_TIMEOUT_S = 3.0
-
-# After a failed attempt.
-RETRY_DELAY_S = 1.0
-
-# The bus is stuck or the session is closed. A later attempt may succeed.
-NOT_READY_ERRORS = (TimeoutError, zenoh.ZError, UsageError)
 
 
 class Stream:
@@ -43,8 +33,8 @@ class Stream:
         self._taking = threading.Lock()
         self._newest: tuple[int, zenoh.Sample | None, int] = (0, None, 0)
         self._text: tuple[int, bytes] = (0, b"null")
-        self.users, self.unused = 0, asyncio.Event()
-        self.serving: asyncio.Task[None] | None = None
+        self.users = 0
+        self.subscription: Any = None  # of Zenoh
         self.wakes: set[Callable[[], object]] = set()  # called for each message, in any thread
 
     @property
@@ -75,62 +65,42 @@ class Stream:
 class Streams:
     """Subscriptions to keys of the robot, each shared by all its users."""
 
-    def __init__(self, client: Callable[[], Connection | None]) -> None:
-        self._client = client  # None before the daemon is connected
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
         self._streams: dict[str, Stream] = {}
 
     def follow(self, key: str) -> Stream:
-        """Return the stream of a key, for which the caller must call `leave` later.
-
-        The subscription begins in the background, as soon as the bus is ready.
-        """
-        stream = self._streams.get(key)
-        if stream is None:
-            stream = self._streams[key] = Stream()
-            stream.serving = asyncio.create_task(self._serve(key, stream))
-        stream.users += 1
+        """Return the stream of a key, for which the caller must call `leave` later."""
+        with self._lock:
+            stream = self._streams.setdefault(key, Stream())
+            stream.users += 1
         return stream
 
     def leave(self, key: str) -> None:
         """Remove one user of a key; the subscription ends with the last one."""
-        stream = self._streams[key]
-        stream.users -= 1
-        if not stream.users:
-            del self._streams[key]
-            stream.unused.set()
+        with self._lock:
+            self._streams[key].users -= 1
 
-    async def _serve(self, key: str, stream: Stream) -> None:
-        subscription = None
-        while subscription is None and stream.users:
-            client = self._client()
-            try:
-                if client is not None:
-                    subscription = await _declare(client, key, stream)
-            except NOT_READY_ERRORS:
-                await asyncio.sleep(RETRY_DELAY_S)
-            if client is None:
-                await asyncio.sleep(0.2)
-        await stream.unused.wait()
-        if subscription is not None:
-            with suppress(*NOT_READY_ERRORS):
-                await in_thread(subscription.undeclare, DECLARE_TIMEOUT_S)
+    def update(self, client: Connection) -> None:
+        """Begin the subscriptions of new users and end the unused ones. This may block."""
+        with self._lock:
+            unused = [key for key, stream in self._streams.items() if not stream.users]
+            ended = [self._streams.pop(key).subscription for key in unused]
+            new = [item for item in self._streams.items() if item[1].subscription is None]
+        with suppress(zenoh.ZError, NoAnswerError):  # the session is closed
+            for subscription in filter(None, ended):
+                subscription.undeclare()
+            for key, stream in new:
+                _subscribe(client, key, stream)
 
 
-async def _declare(client: Connection, key: str, stream: Stream) -> Any:
+def _subscribe(client: Connection, key: str, stream: Stream) -> None:
     def of_it(take: Take) -> Take:
         return lambda sample: take(sample) if has_exact_key(client.key(key), sample) else None
 
-    def declare() -> Any:
-        subscription = client.listen(key, of_it(stream.take))
-        try:
-            # The query gives a first value soon, even if the key is published rarely.
-            client.start_query(key, of_it(stream.answered))
-        except zenoh.ZError:
-            subscription.undeclare()
-            raise
-        return subscription
-
-    return await in_thread(declare, DECLARE_TIMEOUT_S, lambda late: late.undeclare())
+    stream.subscription = client.listen(key, of_it(stream.take))
+    # The query gives a first value soon, even if the key is published rarely.
+    client.start_query(key, of_it(stream.answered))
 
 
 def as_json(encoding: str, payload: bytes) -> bytes:

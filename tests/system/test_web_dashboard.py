@@ -80,7 +80,7 @@ async def test_a_page_of_another_origin_sends_its_token_and_no_cookie(
     token, site_headers = server.invite("operator", "panel"), {"Origin": origin}
     async with server.client() as browser:
         url = f"{server.away}/token"
-        async with browser.post(url, data={"token": token}, allow_redirects=False) as answer:
+        async with browser.post(url, json={"token": token}, allow_redirects=False) as answer:
             assert answer.status == 303
         for headers, status in [({}, 200), (site_headers, 401)]:
             async with browser.get(f"{server.away}/api/state", headers=headers) as answer:

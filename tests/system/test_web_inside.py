@@ -68,9 +68,18 @@ class Inside:
         with socket.create_server(("127.0.0.1", 0)) as listening:
             listening.setblocking(False)
             accepting = asyncio.create_task(self.connections.accept(runner.server, listening, None))
+            updating = asyncio.create_task(self._update())
             yield URL(f"http://127.0.0.1:{listening.getsockname()[1]}")
             accepting.cancel()
+            updating.cancel()
         await runner.cleanup()
+
+    async def _update(self) -> None:
+        """Do the part of the robot's thread."""
+        while True:
+            if self.robot.client is not None:
+                self.robot.streams.update(self.robot.client)
+            await asyncio.sleep(0.01)
 
     @asynccontextmanager
     async def hands(self) -> AsyncIterator[Hands]:
@@ -174,24 +183,6 @@ async def test_a_flood_of_stops_ends_its_connection(inside: Inside) -> None:
         assert ours.socket.close_code == 1008
 
 
-async def test_a_key_that_is_unsubscribed_and_immediately_subscribed_again_is_followed(
-    inside: Inside, tmp_path: Path
-) -> None:
-    with Daemon(tmp_path) as daemon, client_session(daemon.endpoint, "") as session:
-        inside.robot.client = Connection(session, "acsar", "teleop")
-        async with inside.hands() as ours:
-            await ours.say(subscribe="state", rate=10)
-            await ours.state(lambda state: state["mode"])
-            for _ in range(20):
-                await ours.say(unsubscribe="state")
-                await ours.say(subscribe="state", rate=10)
-            await ours.say(ping=1)
-            await ours.find(lambda frame: "pong" in frame)
-            await ours.state(lambda state: state["mode"])
-            (viewer,) = inside.page._viewers
-            assert list(viewer._out.following) == ["state"]
-
-
 async def test_a_client_that_unsubscribes_and_disconnects_leaves_no_subscription(
     inside: Inside, tmp_path: Path
 ) -> None:
@@ -205,7 +196,7 @@ async def test_a_client_that_unsubscribes_and_disconnects_leaves_no_subscription
             await ours.say(unsubscribe="odom")
             await ours.socket.close()
             await eventually(lambda: not inside.page._viewers)
-            assert "odom" not in inside.robot.streams._streams
+            await eventually(lambda: "odom" not in inside.robot.streams._streams)
 
 
 async def test_a_key_comes_when_a_bus_that_was_gone_is_back(inside: Inside, tmp_path: Path) -> None:

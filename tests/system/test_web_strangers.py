@@ -114,7 +114,7 @@ async def test_a_token_becomes_a_cookie_that_no_script_reads_and_ends_when_revok
     token = page.invite("operator", "lent")
     async with page.client() as session:
         form = {"token": token}
-        async with session.post(f"{page.away}/token", data=form, allow_redirects=False) as answer:
+        async with session.post(f"{page.away}/token", json=form, allow_redirects=False) as answer:
             assert answer.status == 303
             cookie = answer.headers["Set-Cookie"]
         for word in ("__Host-acsard-", "HttpOnly", "Secure", "SameSite=Strict", "Path=/"):
@@ -168,7 +168,7 @@ async def test_a_phone_can_use_two_pages_on_one_host_with_its_two_tokens(
             for server, token in invited:
                 form = {"token": token}
                 async with phone.post(
-                    f"{server.away}/token", data=form, allow_redirects=False
+                    f"{server.away}/token", json=form, allow_redirects=False
                 ) as answer:
                     assert answer.status == 303
             for server, name in rooms:

@@ -121,7 +121,7 @@ def on(phone: Phone, story: Callable[[], Awaitable[None]]) -> None:
 
 async def let_in(browser: aiohttp.ClientSession, token: str) -> str:
     """Post a token as the page does, and return the cookie that the server sets."""
-    posted = browser.post(f"{AWAY}/token", data={"token": token}, headers={"Origin": AWAY})
+    posted = browser.post(f"{AWAY}/token", json={"token": token}, headers={"Origin": AWAY})
     async with posted as answer:
         assert answer.status == 200, await answer.text()
         assert "<html" in await answer.text()

@@ -69,12 +69,6 @@ def test_an_invitation_has_the_certified_addresses_at_which_the_server_listens(
     assert urls == [f"https://{at}:8443/" for at in (*older, *newer, own_name())]
 
 
-def test_an_invitation_has_no_ipv4_address_if_another_server_has_that_port(tls: str) -> None:
-    urls = invitations([Listen(False, "127.0.0.1", 8443), Listen(True, "::", 8443)], tls)
-    assert urls
-    assert not any(f"https://{at}:" in url for at in OWN if ":" not in at for url in urls)
-
-
 def test_the_reported_addresses_of_the_page_are_those_of_an_invitation(tls: str) -> None:
     away, here = Listen(True, "0.0.0.0", 8443), Listen(False, "127.0.0.1", 8080)
     assert page_urls(away, tls) == invitations([away], tls)
@@ -89,16 +83,6 @@ def test_a_wildcard_address_is_reached_by_ipv4_and_only_the_ipv6_one_by_ipv6(
     [(endpoint, opened)] = open_sockets([Listen(True, host, free_port())], next_port=False)
     with opened:
         assert {at for at in ("127.0.0.1", "::1") if reached(endpoint.port, at)} == by
-
-
-@pytest.mark.parametrize("first", ["0.0.0.0", "127.0.0.1"])
-def test_an_ipv4_address_and_the_ipv6_wildcard_can_share_a_port(first: str) -> None:
-    port = free_port()
-    for endpoint, opened in open_sockets(
-        [Listen(True, at, port) for at in (first, "::")], next_port=False
-    ):
-        with opened:
-            assert reached(endpoint.port, "::1" if endpoint.host == "::" else "127.0.0.1")
 
 
 def test_a_port_in_use_is_reported_or_the_next_port_is_used() -> None:

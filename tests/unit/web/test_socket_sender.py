@@ -16,7 +16,7 @@ from acsard.web.socket_sender import Following, Outgoing
 from acsard.web.streams import Stream, Streams
 
 REQUEST = make_mocked_request("GET", "/ws")
-STREAMS = Streams(lambda: None)
+STREAMS = Streams()
 
 
 async def test_earlier_messages_do_not_delay_a_key_that_is_due_soon() -> None:

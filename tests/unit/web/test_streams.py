@@ -5,8 +5,9 @@ An answer to a query never replaces a published sample.
 
 from __future__ import annotations
 
-import asyncio
+import time
 from collections.abc import Iterator
+from unittest.mock import Mock
 
 import pytest
 import zenoh
@@ -15,6 +16,7 @@ from acsard.client.connection import Connection
 from acsard.core.values import NS_PER_S
 from acsard.host import clock
 from acsard.web.streams import Stream, Streams
+from tests.system.harness import until
 
 KEY = "acsard/acsar/events"
 
@@ -79,18 +81,27 @@ def test_an_age_is_never_negative(
     assert stream.value()[2] == 0.0
 
 
-async def test_a_put_on_a_wildcard_is_not_a_message_of_the_key(session: zenoh.Session) -> None:
-    streams = Streams(lambda: Connection(session, "acsar", "app"))
+def test_a_put_on_a_wildcard_is_not_a_message_of_the_key(session: zenoh.Session) -> None:
+    streams, client = Streams(), Connection(session, "acsar", "app")
     stream = streams.follow("events")
-    async with asyncio.timeout(10.0):
-        while not stream.number:  # the subscription begins in the background
-            session.put(KEY, b"0", encoding="application/json")
-            await asyncio.sleep(0.05)
-    before = stream.number
+    streams.update(client)
     for key, payload in ((KEY, b"1"), ("acsard/**", b"666"), ("acsard/*/*", b"667"), (KEY, b"2")):
         session.put(key, payload, encoding="application/json")
-    async with asyncio.timeout(10.0):
-        while stream.value()[1] != b"2":  # it arrives on a Zenoh thread
-            await asyncio.sleep(0.001)
+    until(lambda: stream.value()[1] == b"2", 10.0, "it arrives on a Zenoh thread")
+    assert stream.number == 2
     streams.leave("events")
-    assert stream.value()[:2] == (before + 2, b"2")
+    streams.update(client)
+    session.put(KEY, b"3", encoding="application/json")
+    time.sleep(0.1)
+    assert stream.value()[:2] == (2, b"2")
+
+
+def test_a_key_that_is_left_and_followed_again_keeps_its_subscription() -> None:
+    streams, client = Streams(), Mock()
+    first = streams.follow("odom")
+    streams.update(client)
+    streams.leave("odom")
+    assert streams.follow("odom") is first
+    streams.update(client)
+    assert client.listen.call_count == 1
+    assert not first.subscription.undeclare.called
