@@ -61,6 +61,31 @@ MAX_ANSWER_DELAY_NS = NS_PER_S // 5
 DISK_HANGS = f"the disk did not answer within {HANG_TIMEOUT_S:g} s"
 
 
+class Disk:
+    """What the latch file asks of the file system, and how long it waits. Tests give another."""
+
+    hang_timeout_s = HANG_TIMEOUT_S
+    retry_pause_s = RETRY_PAUSE_S
+
+    def read(self, path: Path) -> bytes:
+        # Without O_NONBLOCK, opening a named pipe at this path would block the start.
+        handle = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
+        with os.fdopen(handle, "rb") as file:
+            about = os.fstat(handle)
+            if not stat.S_ISREG(about.st_mode):
+                raise OSError(errno.EINVAL, "it is not a regular file")
+            data = file.read(MAX_BYTES + 1)
+        if len(data) > MAX_BYTES:
+            raise OSError(errno.EFBIG, f"the file has more than {MAX_BYTES} bytes")
+        return data
+
+    def write(self, path: Path, data: bytes) -> None:
+        replace_file(path, data, synced=False)
+
+    def sync(self, path: Path) -> None:
+        sync(path)
+
+
 class LatchFileError(AcsardError):
     """The content of a latch file is damaged, of another version or of another robot."""
 
@@ -196,8 +221,11 @@ class Keeper:
 class LatchFile(Keeper):
     """The file that stores a robot's latches over a restart: `start()` once, then `keep()`."""
 
-    def __init__(self, config: Config, environ: Mapping[str, str]) -> None:
+    def __init__(
+        self, config: Config, environ: Mapping[str, str], disk: Disk | None = None
+    ) -> None:
         super().__init__(Latches())
+        self._disk = disk or Disk()
         self.where = "no directory"  # for messages
         self._robot, self._path, self._no_place = config.robot.id, Path(), ""
         try:
@@ -220,7 +248,7 @@ class LatchFile(Keeper):
         file.
         """
         try:
-            self.latches = await in_thread(lambda: self._read(now), HANG_TIMEOUT_S)
+            self.latches = await in_thread(lambda: self._read(now), self._disk.hang_timeout_s)
         except TimeoutError as error:
             why = str(error) if isinstance(error, NoThreadError) else DISK_HANGS
             self.latches = unreadable(self.where, why, now)
@@ -229,7 +257,7 @@ class LatchFile(Keeper):
             self._thread.start()
         except NoThreadError as error:
             self._failed = str(error)
-        end_ns = clock.mono_ns() + HANG_TIMEOUT_S * NS_PER_S
+        end_ns = clock.mono_ns() + self._disk.hang_timeout_s * NS_PER_S
         while self._renamed is None and not self._failed:
             if clock.mono_ns() > end_ns:
                 self._failed = DISK_HANGS
@@ -260,7 +288,7 @@ class LatchFile(Keeper):
         except OSError as error:
             return unreadable(self.where, _reason(error), now)
         try:
-            return decode(self._robot, _content(path))
+            return decode(self._robot, self._disk.read(path))
         except (OSError, LatchFileError) as error:
             return unreadable(self.where, _reason(error), now)
 
@@ -307,7 +335,8 @@ class LatchFile(Keeper):
             time.sleep(0.001)
 
     def take_events(self) -> list[Event]:
-        self._hangs = self._timer.wait_ns(clock.mono_ns()) > HANG_TIMEOUT_S * NS_PER_S
+        timeout_ns = self._disk.hang_timeout_s * NS_PER_S
+        self._hangs = self._timer.wait_ns(clock.mono_ns()) > timeout_ns
         trouble = self.trouble
         if trouble == self._told:
             return []
@@ -346,7 +375,7 @@ class LatchFile(Keeper):
                     time.sleep(MIN_WRITE_PAUSE_S)
             if over:
                 return
-            self._box.wait(None if latches is None else RETRY_PAUSE_S)
+            self._box.wait(None if latches is None else self._disk.retry_pause_s)
 
     def _write(self, latches: Latches) -> bool:
         self._timer.begin()
@@ -354,10 +383,10 @@ class LatchFile(Keeper):
             if self._no_place:
                 raise OSError(errno.ENOENT, self._no_place)
             self._path.parent.mkdir(parents=True, exist_ok=True)
-            replace_file(self._path, encode(self._robot, latches), synced=False)
+            self._disk.write(self._path, encode(self._robot, latches))
             self._renamed = latches
-            sync(self._path)
-            sync(self._path.parent)
+            self._disk.sync(self._path)
+            self._disk.sync(self._path.parent)
         except OSError as error:
             # The kernel may have dropped the bytes that it could not sync, so all is done again.
             self._failed = _reason(error)
@@ -391,19 +420,6 @@ def _with_known_code(raw: Any) -> Any:
 
 def _safe(text: str) -> str:
     return text[:MAX_TEXT_LENGTH].encode(errors="replace").decode()
-
-
-def _content(path: Path) -> bytes:
-    # Without O_NONBLOCK, opening a named pipe at this path would block the start.
-    handle = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
-    with os.fdopen(handle, "rb") as file:
-        about = os.fstat(handle)
-        if not stat.S_ISREG(about.st_mode):
-            raise OSError(errno.EINVAL, "it is not a regular file")
-        data = file.read(MAX_BYTES + 1)
-    if len(data) > MAX_BYTES:
-        raise OSError(errno.EFBIG, f"the file has more than {MAX_BYTES} bytes")
-    return data
 
 
 def _reason(error: Exception) -> str:

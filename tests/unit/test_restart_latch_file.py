@@ -1,0 +1,499 @@
+"""A stop survives a restart: the latch file on disks that are full, fail or hang."""
+
+from __future__ import annotations
+
+import asyncio
+import errno
+import fcntl
+import os
+import re
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+from msgspec.structs import replace
+
+from acsard.core.config.settings import Config, ControlConfig
+from acsard.core.motion.latches import after_restart
+from acsard.core.values import NS_PER_S, Cause, Instant, Latches
+from acsard.daemon import latch_file as module
+from acsard.daemon.latch_file import (
+    DISK_HANGS,
+    MAX_BYTES,
+    Disk,
+    Keeper,
+    LatchFile,
+    encode,
+    place,
+)
+from acsard.host import clock
+from acsard.host.errors import InUseError
+from tests.faults import BROKEN, FULL, HANGS, FaultyDisk
+from tests.system.harness import until
+
+NOW = Instant(7_000_000_000, 1_800_000_000_000_000_000)
+AT_NS = NOW.wall_ns
+JOE = Cause(5_000_001, "stop", "stopped", "stopped by joe", by="joe", at_ns=AT_NS)
+RUNAWAY = Cause(5_000_002, "fault", "wheel_runaway", "a wheel runs", "front_left", at_ns=AT_NS)
+PAGE = Cause(5_000_003, "inactive", "switched_off", "switched off by page", by="page", at_ns=AT_NS)
+STOP, FAULT = Latches((JOE,), 5_000_001), Latches((RUNAWAY,), 5_000_002)
+OFF, ALL = Latches((PAGE,), 5_000_003), Latches((JOE, RUNAWAY, PAGE), 5_000_003)
+NONE = Latches(last=5_000_000)
+NAME = "acsar.latches.json"
+
+Started = Callable[..., LatchFile]
+
+
+def config(where: Path) -> Config:
+    return replace(Config(), control=replace(Config().control, state_directory=str(where)))
+
+
+@pytest.fixture(name="started")
+def _started() -> Iterator[Started]:
+    """Yield a function that starts a robot's latch file, and end the files after the test."""
+    files: list[tuple[LatchFile, Disk | None]] = []
+
+    def start(where: Path, disk: Disk | None = None) -> LatchFile:
+        file = LatchFile(config(where), {}, disk)
+        files.append((file, disk))
+        asyncio.run(file.start(NOW))
+        return file
+
+    yield start
+    for file, disk in files:
+        if isinstance(disk, FaultyDisk):
+            disk.goes.set()
+        end(file)
+
+
+def end(file: LatchFile) -> None:
+    """Close the latch file as the daemon's end does: write it a last time and release the lock."""
+    file.close()
+    if file._lock >= 0:
+        os.close(file._lock)
+        file._lock = -1
+
+
+@pytest.fixture(name="file")
+def _file(tmp_path: Path, started: Started) -> LatchFile:
+    """Return the latch file of a robot after its first start."""
+    file = started(tmp_path)
+    until(lambda: file.is_stored)
+    return file
+
+
+def kept(latches: Latches) -> tuple[Cause, ...]:
+    """Return the causes as the next start has them."""
+    return after_restart(latches).causes
+
+
+def stopped_at_start(file: LatchFile) -> str:
+    """Return the texts of the stops that the daemon itself has set; "" without one."""
+    causes = file.latches.causes
+    return "; ".join(cause.text for cause in causes if cause.code == "stopped_at_start")
+
+
+def test_a_first_start_has_no_latches_and_creates_the_file(
+    tmp_path: Path, started: Started
+) -> None:
+    file = started(tmp_path / "state" / "acsard")
+    assert (file.latches.causes, file.trouble) == ((), "")
+    assert (tmp_path / "state" / "acsard" / NAME).read_bytes() == encode("acsar", file.latches)
+
+
+@pytest.mark.parametrize("latches", [STOP, FAULT])
+def test_latches_are_in_force_at_the_next_start_until_they_are_cleared(
+    latches: Latches, tmp_path: Path, started: Started
+) -> None:
+    for held in (latches, NONE):
+        file = started(tmp_path)
+        file.keep(held)
+        end(file)
+        file = started(tmp_path)
+        assert file.latches.causes == kept(held)
+        end(file)
+
+
+def half(path: Path) -> None:
+    path.write_bytes(encode("acsar", STOP)[:80])
+
+
+def too_large(path: Path) -> None:
+    path.write_bytes(encode("acsar", STOP) + b" " * MAX_BYTES)
+
+
+def link_to_itself(path: Path) -> None:
+    path.symlink_to(path)
+
+
+def link_to_nothing(path: Path) -> None:
+    path.symlink_to(path.with_name("unmounted"))
+
+
+def link_to_pipe(path: Path) -> None:
+    # A link to /dev/null must not make the daemon of root replace /dev/null.
+    os.mkfifo(path.with_name("special"))
+    path.symlink_to(path.with_name("special"))
+
+
+@pytest.mark.parametrize(
+    "spoil",
+    [
+        Path.touch,
+        half,
+        Path.mkdir,
+        os.mkfifo,
+        link_to_itself,
+        link_to_nothing,
+        link_to_pipe,
+        too_large,
+    ],
+)  # fmt: skip
+def test_a_file_that_cannot_be_read_starts_the_robot_stopped_and_that_is_kept(
+    spoil: Callable[[Path], None], tmp_path: Path, started: Started
+) -> None:
+    spoil(tmp_path / NAME)
+    file = started(tmp_path)
+    text = stopped_at_start(file)
+    assert f"the latch file ({tmp_path / NAME}) cannot be read: " in text
+    assert "; a stop may have been lost" in text
+    assert not (tmp_path / "special").is_file()
+    end(file)
+    if spoil is half:
+        assert started(tmp_path).latches.causes == kept(file.latches)
+
+
+@pytest.mark.parametrize("number", [errno.ESTALE, errno.EACCES])
+def test_a_name_that_cannot_be_looked_up_is_not_a_first_start(
+    number: int, tmp_path: Path, started: Started, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / NAME).write_bytes(encode("acsar", STOP))
+    usual = os.lstat
+
+    def fails(path: str | Path) -> os.stat_result:
+        if Path(path) == tmp_path / NAME:
+            raise OSError(number, os.strerror(number))
+        return usual(path)
+
+    with monkeypatch.context() as patched:
+        patched.setattr(os, "lstat", fails)
+        file = started(tmp_path)
+    assert stopped_at_start(file)
+
+
+def linked(directory: Path) -> tuple[Path, Path]:
+    """Make a state directory whose latch file links to one without latches on another partition."""
+    state, file = directory / "state", directory / "persistent" / "robot.json"
+    state.mkdir()
+    file.parent.mkdir()
+    file.write_bytes(encode("acsar", NONE))
+    (state / NAME).symlink_to("../persistent/robot.json")
+    return state, file
+
+
+def test_a_stop_is_written_to_the_target_of_a_link_and_synced_there(
+    tmp_path: Path, started: Started
+) -> None:
+    """The state directory may be volatile, and the link may lead to a partition that is not."""
+    (state, target), disk = linked(tmp_path), FaultyDisk()
+    target.with_name(".robot.json.k1ll3d").touch()
+    file = started(state, disk)
+    assert file.latches.causes == ()
+    file.keep(STOP)
+    end(file)
+    assert (state / NAME).is_symlink()
+    assert target.read_bytes() == encode("acsar", STOP)
+    assert [path for call, path, _ in disk.calls if call == "sync"] == [target, target.parent] * 2
+    assert os.listdir(state) == [NAME]
+    assert sorted(os.listdir(target.parent)) == ["robot.json", "robot.lock"]
+    assert started(state).latches.causes == kept(STOP)
+
+
+def test_a_second_daemon_of_the_same_file_does_not_start(tmp_path: Path, started: Started) -> None:
+    state, target = linked(tmp_path)
+    other = tmp_path / "other"
+    other.mkdir()
+    (other / NAME).symlink_to(target)
+    started(state)
+    for directory in (state, other):
+        with pytest.raises(InUseError, match=re.escape(str(target))):
+            started(directory)
+
+
+def test_two_robots_in_one_directory_have_separate_files(tmp_path: Path, started: Started) -> None:
+    started(tmp_path).keep(STOP)
+    other = LatchFile(replace(config(tmp_path), robot=replace(Config().robot, id="two")), {})
+    asyncio.run(other.start(NOW))
+    assert other.latches.causes == ()
+    end(other)
+
+
+def test_the_temporary_file_of_a_killed_write_is_removed(tmp_path: Path, started: Started) -> None:
+    (tmp_path / f".{NAME}.k1ll3d").touch()
+    started(tmp_path)
+    assert not list(tmp_path.glob(f".{NAME}.*"))
+
+
+def test_a_file_system_without_lists_and_locks_still_keeps_latches(
+    tmp_path: Path, started: Started, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def without(*_: object) -> None:
+        raise OSError(errno.ENOLCK, os.strerror(errno.ENOLCK))
+
+    monkeypatch.setattr(Path, "glob", without)
+    end(started(tmp_path))
+    monkeypatch.setattr(fcntl, "flock", without)
+    file = started(tmp_path)
+    file.keep(STOP)
+    end(file)
+    assert started(tmp_path).latches.causes == kept(STOP)
+
+
+@pytest.mark.parametrize("directory", ["", "~nobody-has-this-name/acsard"])
+def test_without_a_directory_the_robot_starts_stopped(
+    directory: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def nowhere() -> Path:
+        raise RuntimeError("Could not determine home directory.")
+
+    monkeypatch.setattr(Path, "home", nowhere)
+    file = LatchFile(replace(Config(), control=ControlConfig(state_directory=directory)), {})
+    asyncio.run(file.start(NOW))
+    file.close()
+    assert "control.state_directory" in stopped_at_start(file)
+
+
+def test_a_directory_that_is_a_file_starts_the_robot_stopped(
+    tmp_path: Path, started: Started
+) -> None:
+    (tmp_path / "file").touch()
+    file = started(tmp_path / "file")
+    assert "cannot be written" in stopped_at_start(file)
+    assert file.trouble
+
+
+def test_the_latch_file_is_in_the_first_place_that_is_set() -> None:
+    service, user = {"STATE_DIRECTORY": "/var/lib/acsard:/var/lib/b"}, {"XDG_STATE_HOME": "/u"}
+    assert place(config(Path("/mine")), service | user) == Path("/mine") / NAME
+    assert place(Config(), service | user) == Path("/var/lib/acsard") / NAME
+    assert place(Config(), user) == Path("/u/acsard") / NAME
+    assert place(Config(), {}) == Path.home() / ".local/state/acsard" / NAME
+    # The specification of the variable says that a relative path must be ignored.
+    assert place(Config(), {"XDG_STATE_HOME": "state"}) == place(Config(), {})
+    assert place(config(Path("~/mine")), {}) == Path.home() / "mine" / NAME
+
+
+# faults of the disk
+
+SAID = {FULL: "No space left on device", BROKEN: "Input/output error", HANGS: DISK_HANGS}
+
+
+def levels(file: LatchFile) -> list[str]:
+    """Return the levels of the new events of the file, as a control step takes them."""
+    return [event.level for event in file.take_events()]
+
+
+@pytest.mark.parametrize(
+    ("call", "fault", "stops", "is_trouble"),
+    [
+        # What was on the disk cannot be known, so the robot starts stopped.
+        ("read", BROKEN, True, False),
+        ("read", HANGS, True, False),
+        # The run before may have lost a stop for the same reason.
+        ("write", FULL, True, True),
+        ("write", HANGS, True, True),
+        # The file has all latches, and a power cut may lose them.
+        ("sync", HANGS, False, True),
+    ],
+)
+def test_a_fault_of_the_disk_at_the_start(
+    call: str, fault: int, stops: bool, is_trouble: bool, tmp_path: Path, started: Started
+) -> None:
+    (tmp_path / NAME).write_bytes(encode("acsar", OFF))
+    disk = FaultyDisk(**{call: fault})
+    file = started(tmp_path, disk)
+    latches = file.latches
+    assert (SAID[fault] in stopped_at_start(file)) == stops
+    assert (latches.causes[0] == kept(OFF)[0]) == (call != "read")
+    if is_trouble:
+        until(lambda: levels(file) == ["warning"])
+        assert f"({tmp_path / NAME}) cannot be written: {SAID[fault]}" in file.trouble
+    disk.mend()
+    until(lambda: not file.take_events() and not file.trouble and file.is_stored)
+    # A read that comes late changes nothing.
+    assert file.latches is latches
+    assert (tmp_path / NAME).read_bytes() == encode("acsar", latches)
+
+
+@pytest.mark.parametrize(
+    ("call", "fault"),
+    [("write", FULL), ("write", HANGS), ("sync", BROKEN), ("sync", HANGS)],
+)
+def test_a_later_fault_of_the_disk_is_told_once_and_tried_until_it_has_gone(
+    call: str, fault: int, tmp_path: Path, started: Started
+) -> None:
+    disk = FaultyDisk()
+    file = started(tmp_path, disk)
+    until(lambda: file.is_stored)
+    disk.faults = {call: fault}
+    file.keep(STOP)
+    assert until(lambda: levels(file)) == ["warning"]
+    assert SAID[fault] in file.trouble
+    began = time.monotonic()
+    file.wait()  # the answer to a stop waits for a disk that hangs, and not for one that fails
+    assert (time.monotonic() - began >= 0.2) == (fault == HANGS)
+    assert (file.is_stored, levels(file)) == (False, [])
+    content = (tmp_path / NAME).read_bytes()
+    assert (content == encode("acsar", STOP)) == (call == "sync")  # a kill loses nothing then
+    disk.mend()
+    assert until(lambda: levels(file)) == ["info"]
+    assert (file.is_stored, file.trouble) == (True, "")
+    assert (tmp_path / NAME).read_bytes() == encode("acsar", STOP)
+
+
+def test_a_disk_that_hangs_and_then_fails_has_not_recovered(
+    tmp_path: Path, started: Started
+) -> None:
+    disk = FaultyDisk()
+    file = started(tmp_path, disk)
+    until(lambda: file.is_stored)
+    disk.faults = {"sync": HANGS}
+    file.keep(STOP)
+    assert until(lambda: levels(file)) == ["warning"]
+    disk.faults = {"sync": HANGS, "write": FULL}
+    file.keep(FAULT)
+    disk.goes.set()
+    until(lambda: SAID[FULL] in file.trouble)
+    assert levels(file) == ["warning"]
+
+
+def test_an_old_stop_on_a_full_disk_keeps_its_name(tmp_path: Path, started: Started) -> None:
+    """The old stop may have been released, and a later one lost, so the robot starts stopped."""
+    (tmp_path / NAME).write_bytes(encode("acsar", STOP))
+    numbers = set()
+    for _ in range(2):
+        file = started(tmp_path, FaultyDisk(write=FULL))
+        assert file.latches.causes[0] == kept(STOP)[0]
+        numbers.add(file.latches.causes[1].number)
+        end(file)
+    assert len(numbers) == 2
+
+
+def test_a_sync_that_fails_does_not_undo_a_stop_that_came_meanwhile(
+    tmp_path: Path, started: Started
+) -> None:
+    disk = FaultyDisk(sync=BROKEN)
+    file = started(tmp_path, disk)
+    until(lambda: file.trouble)
+    file.keep(STOP)
+    disk.mend()
+    until(lambda: file.trouble == "")
+    end(file)
+    assert (tmp_path / NAME).read_bytes() == encode("acsar", STOP)
+
+
+def test_only_the_newest_latches_are_written_when_the_disk_works_again(
+    tmp_path: Path, started: Started
+) -> None:
+    disk = FaultyDisk()
+    file = started(tmp_path, disk)
+    until(lambda: file.is_stored)
+    disk.calls.clear()
+    disk.faults = {"write": HANGS}
+    file.keep(FAULT)
+    until(lambda: disk.calls)
+    for latches in (STOP, NONE, STOP, FAULT, STOP):
+        file.keep(latches)
+    disk.mend()
+    end(file)
+    written = [data for call, _, data in disk.calls if call == "write"]
+    assert written == [encode("acsar", FAULT), encode("acsar", STOP)]
+
+
+def test_a_flood_of_stops_is_written_at_a_pace(tmp_path: Path, started: Started) -> None:
+    disk = FaultyDisk()
+    file = started(tmp_path, disk)
+    began = time.monotonic()
+    for number in range(40):
+        file.keep(Latches((replace(JOE, number=number),), number))
+        time.sleep(0.005)
+    end(file)
+    written = [data for call, _, data in disk.calls if call == "write"]
+    assert len(written) <= (time.monotonic() - began) / module.MIN_WRITE_PAUSE_S + 3
+    assert b'"number": 39' in written[-1]
+
+
+def test_latches_that_arrive_while_the_file_closes_are_written(
+    tmp_path: Path, file: LatchFile, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pop = file._box.pop
+
+    def late() -> Latches | None:
+        latches = pop()
+        if latches is FAULT:  # the thread has taken it; now a stop and the end come at once
+            file.keep(STOP)
+            file._box.close()
+        return latches
+
+    monkeypatch.setattr(file._box, "pop", late)
+    file.keep(FAULT)
+    until(lambda: not file._thread.is_alive())
+    assert (tmp_path / NAME).read_bytes() == encode("acsar", STOP)
+    assert file.trouble, "a thread that has ended is reported"
+
+
+def test_a_wait_ends_when_the_latches_are_stored(file: LatchFile) -> None:
+    file.keep(STOP)
+    file.wait()
+    assert file.is_stored
+
+
+def test_the_close_waits_for_a_stuck_disk_only_until_its_timeout(
+    tmp_path: Path, started: Started
+) -> None:
+    file = started(tmp_path, FaultyDisk(sync=HANGS))
+    began = time.monotonic()
+    file.close()
+    assert module.CLOSE_TIMEOUT_S <= time.monotonic() - began < module.CLOSE_TIMEOUT_S + 5.0
+
+
+def test_a_process_that_was_stopped_during_a_sync_does_not_report_the_disk(
+    tmp_path: Path, started: Started, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    disk = FaultyDisk(sync=HANGS)
+    file = started(tmp_path, disk)
+    file.take_events()
+    later_ns = clock.mono_ns() + int(10 * disk.hang_timeout_s * NS_PER_S)
+    with monkeypatch.context() as patched:
+        patched.setattr(clock, "mono_ns", lambda: later_ns)
+        assert (file.take_events(), file.trouble) == ([], "")
+
+
+@pytest.mark.parametrize("name", ["latches", "<lambda>"])
+def test_a_process_without_room_for_a_thread_starts_the_robot_stopped(
+    name: str, tmp_path: Path, started: Started, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    usual = threading.Thread.start
+
+    def start(self: threading.Thread) -> None:
+        if self.name == name:
+            raise RuntimeError("can't start new thread")
+        usual(self)
+
+    monkeypatch.setattr(threading.Thread, "start", start)
+    file = started(tmp_path)
+    assert "can't start new thread" in stopped_at_start(file)
+    if name == "latches":
+        file.wait()
+        assert not file.is_stored
+        assert file.trouble
+
+
+def test_without_a_file_every_answer_is_sent_at_once_and_nothing_is_reported() -> None:
+    keeper = Keeper(NONE)
+    keeper.keep(STOP)
+    keeper.wait()
+    assert (keeper.latches, keeper.is_stored, keeper.trouble) == (STOP, True, None)
+    assert keeper.take_events() == []
