@@ -30,7 +30,7 @@ from acsard.host import clock
 from acsard.host.errors import NoAnswerError, NotDrivenError, UsageError
 from tests.each import each
 from tests.unit.client.test_course import Robot as StandingRobot
-from tests.unit.top.screens import raw_sample, sample_of
+from tests.unit.screens import raw_sample, sample_of
 
 US, OTHER = "joe/1/aa", "ann/2/bb"
 NEUTRAL = "send a zero first: app must send a zero"
@@ -66,7 +66,10 @@ class World:
 
     source, sender = "app", US
 
+    newest: World
+
     def __init__(self, responder: Says) -> None:
+        World.newest = self
         self.now = 100.0
         self.sent: list[float] = []
         self.asked = 0
@@ -95,7 +98,7 @@ class World:
         self.subscribed = False
 
     def try_recv(self) -> Any:
-        if not self.published or self.now < self._told or self.now - 100.0 >= self.dies:
+        if not self.published or self.now < self._told or self.passed >= self.dies:
             return None
         self._told = self.now + 0.1
         self.stored = self._sample()
@@ -103,27 +106,26 @@ class World:
 
     def start_query(self, name: str, take: Any) -> None:
         self.asked += 1
-        sample = self._sample() if self.now - 100.0 < self.dies else self.stored
+        sample = self._sample() if self.passed < self.dies else self.stored
         if self.answers and sample is not None:
             take(sample)
 
     def _sample(self) -> Any:
-        state = self._says(self.now - 100.0, self.sent[-1] if self.sent else 0.0, self.sent)
+        state = self._says(self.passed, self.sent[-1] if self.sent else 0.0, self.sent)
         if state is None:
             return None
         return sample_of(replace(state, stamp=Time.from_ns(int(self.now * NS_PER_S))))
 
-    def set_clock(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        """Let the clock that also advances during a suspend show `now`."""
-        monkeypatch.setattr(clock, "steady_s", lambda: self.now)
+    @property
+    def passed(self) -> float:
+        return self.now - 100.0
 
-    def drive(self, monkeypatch: pytest.MonkeyPatch, seconds: float = 1.0) -> float:
+    def drive(self, seconds: float = 1.0) -> float:
         """Drive at 0.5 m/s and return how long it took, s."""
-        self.set_clock(monkeypatch)
         for pause in self.steps(seconds):
             self.now += pause
             self._stall()
-        return self.now - 100.0
+        return self.passed
 
     def steps(self, seconds: float = 1.0) -> Iterator[float]:
         """Yield the pauses of a drive at 0.5 m/s, and send one zero after an error."""
@@ -139,15 +141,21 @@ class World:
 
     def _block(self) -> None:
         begin, blocked = self.blocks
-        if self.now - 100.0 >= begin:
+        if self.passed >= begin:
             self.now += blocked
             self.blocks = math.inf, 0.0
 
     def _stall(self) -> None:
         begin, stalled = self.stalls
-        if self.now - 100.0 >= begin:
+        if self.passed >= begin:
             self.now += stalled
             self.stalls = math.inf, 0.0
+
+
+@pytest.fixture(autouse=True)
+def _clock(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let the clock that also advances during a suspend show the time of the newest world."""
+    monkeypatch.setattr(clock, "steady_s", lambda: World.newest.now)
 
 
 def followed(t: float, last: float, sent: list[float]) -> RobotState:
@@ -160,25 +168,22 @@ def followed(t: float, last: float, sent: list[float]) -> RobotState:
     return replace(FOLLOWED, linear=last or (0.2 if any(sent) and t < 1.8 else 0.0))
 
 
-def test_a_drive_starts_with_zeros_and_returns_when_the_robot_is_at_rest(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_a_drive_starts_with_zeros_and_returns_when_the_robot_is_at_rest() -> None:
     world = World(followed)
-    took = world.drive(monkeypatch)
+    took = world.drive()
     first = world.sent.index(0.5)
     assert set(world.sent[:first]) == {0.0}
     assert first >= 20
     assert world.sent.count(0.5) in (20, 21)  # the last one may cover a fraction of a period
     assert world.sent[-1] == 0.0
     assert 1.6 <= took < 2.1
-    assert not world.subscribed
-    assert world.asked == 0
+    assert (world.subscribed, world.asked) == (False, 0)
 
 
-def test_a_state_that_is_rarely_published_is_queried(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_state_that_is_rarely_published_is_queried() -> None:
     world = World(followed)
     world.published = False
-    assert world.drive(monkeypatch) < 2.4
+    assert world.drive() < 2.4
     assert world.sent.count(0.5) in (20, 21)
     assert world.asked < 12
 
@@ -186,11 +191,7 @@ def test_a_state_that_is_rarely_published_is_queried(monkeypatch: pytest.MonkeyP
 def test_an_answer_of_another_thread_is_processed_on_the_driving_thread(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Only one thread may process states.
-
-    With two threads the drive could combine the time of one state with the refusal in another
-    state.
-    """
+    # With two threads the drive could combine the time of one state with the refusal in another.
     world, readers = World(followed), set()
     world.published = False
     made = world._sample
@@ -212,30 +213,28 @@ def test_an_answer_of_another_thread_is_processed_on_the_driving_thread(
         thread.join()
 
     monkeypatch.setattr(world, "start_query", ask)
-    world.drive(monkeypatch)
+    world.drive()
     assert readers == {get_ident()}
 
 
-def test_a_drive_does_not_wait_long_for_a_robot_that_keeps_moving(
-    monkeypatch: pytest.MonkeyPatch,
+def without_speed(t: float, last: float, sent: list[float]) -> RobotState:
+    state = followed(t, last, sent)
+    return state if t < 1.3 else replace(state, linear=None, angular=None)
+
+
+@each(
+    ("responder", "least", "most"),
+    [
+        (lambda t, last, sent: replace(FOLLOWED, linear=0.3), 2.3, 3.0),
+        (without_speed, 2.0, 3.0),
+        # A long ramp.
+        (lambda t, last, sent: replace(FOLLOWED, linear=max(0.0, 0.5 - t / 20)), 9.7, 10.2),
+    ],
+)
+def test_a_drive_waits_for_rest_as_long_as_the_robot_slows_down(
+    responder: Says, least: float, most: float
 ) -> None:
-    world = World(lambda t, last, sent: replace(FOLLOWED, linear=0.3))
-    assert 2.3 < world.drive(monkeypatch) < 3.0
-
-
-def test_a_drive_does_not_wait_long_for_a_robot_that_reports_no_speed(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    def lost(t: float, last: float, sent: list[float]) -> RobotState:
-        state = followed(t, last, sent)
-        return state if t < 1.3 else replace(state, linear=None, angular=None)
-
-    assert 2.0 < World(lost).drive(monkeypatch) < 3.0
-
-
-def test_a_drive_waits_for_the_end_of_a_long_ramp(monkeypatch: pytest.MonkeyPatch) -> None:
-    world = World(lambda t, last, sent: replace(FOLLOWED, linear=max(0.0, 0.5 - t / 20)))
-    assert 9.7 < world.drive(monkeypatch) < 10.2
+    assert least < World(responder).drive() < most
 
 
 def after(seconds: float, state: RobotState | None) -> Says:
@@ -268,171 +267,112 @@ AGAINST: list[tuple[str, Says, type[Exception], str, float, bool]] = [
 ]  # fmt: skip
 
 
-@pytest.mark.parametrize(
-    ("responder", "error", "words", "took", "moved"),
-    [c[1:] for c in AGAINST],
-    ids=[c[0] for c in AGAINST],
-)
+@each(("name", "responder", "error", "words", "took", "moved"), AGAINST)
 def test_a_drive_that_is_not_followed_ends_with_the_reason_and_a_zero(
-    monkeypatch: pytest.MonkeyPatch,
-    responder: Says,
-    error: type[Exception],
-    words: str,
-    took: float,
-    moved: bool,
+    name: str, responder: Says, error: type[Exception], words: str, took: float, moved: bool
 ) -> None:
     world = World(responder)
     with pytest.raises(error, match=words):
-        world.drive(monkeypatch, 60.0)
-    assert took - 0.05 <= world.now - 100.0 <= took + 0.3
+        world.drive(60.0)
+    assert took - 0.05 <= world.passed <= took + 0.3
     assert (0.5 in world.sent) == moved
-    assert world.sent[-1] == 0.0
-    assert not world.subscribed
+    assert (world.sent[-1], world.subscribed) == (0.0, False)
 
 
-def test_a_short_drive_that_was_hardly_followed_does_not_return_as_a_success(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_a_short_drive_that_was_hardly_followed_does_not_return_as_a_success() -> None:
     with pytest.raises(NotDrivenError, match="has priority"):
-        World(after(0.45, HIGHER)).drive(monkeypatch, 0.8 * GRACE_S)
+        World(after(0.45, HIGHER)).drive(0.8 * GRACE_S)
 
 
-def test_a_short_time_in_which_the_robot_follows_no_source_does_not_end_a_drive(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_a_short_time_in_which_the_robot_follows_no_source_does_not_end_a_drive() -> None:
     held_up = replace(FOLLOWED, mode="ready", reason="waiting for a command", source="")
-
-    def says(t: float, last: float, sent: list[float]) -> RobotState:
-        return held_up if 0.9 < t < 1.2 else followed(t, last, sent)
-
-    world = World(says)
-    world.drive(monkeypatch)
+    world = World(lambda *of: held_up if 0.9 < of[0] < 1.2 else followed(*of))
+    world.drive()
     assert world.sent.count(0.5) in (20, 21)
 
 
-@pytest.mark.parametrize("begins", [0.1, 0.9], ids=["opening", "driving"])
-def test_a_drive_ends_after_the_client_program_stalled(
-    monkeypatch: pytest.MonkeyPatch, begins: float
+@each(
+    ("trouble", "begins", "lasts", "seconds"),
+    [
+        ("stalls", 0.1, 4.0, 60.0),
+        ("stalls", 0.9, 4.0, 60.0),
+        ("stalls", 0.9, 4.0, 1.0),  # the end of the drive passes meanwhile
+        ("blocks", 0.1, 0.6, 60.0),
+        ("blocks", 0.9, 0.6, 60.0),
+    ],
+)
+def test_a_drive_ends_after_the_program_stalled_or_the_bus_accepted_no_command(
+    trouble: str, begins: float, lasts: float, seconds: float
 ) -> None:
-    """The daemon publishes its state during the stall, so a state waits in the client's queue."""
+    """The daemon publishes its state during a stall, so a state waits in the client's queue."""
     world = World(followed)
-    world.stalls = begins, 4.0
-    words = r"sent no command for 4\.[01] s.*not finished.*suspended"
-    with pytest.raises(NotDrivenError, match=words):
-        world.drive(monkeypatch, 60.0)
-    assert begins + 4.0 <= world.now - 100.0 < begins + 4.1
+    setattr(world, trouble, (begins, lasts))
+    words = rf"sent no command for {lasts:.0f}\.[01] s" if lasts > 1 else r"command for 0\.[67] s"
+    with pytest.raises(NotDrivenError, match=rf"{words}.*not finished.*suspended"):
+        world.drive(seconds)
+    assert begins + lasts <= world.passed < begins + lasts + 0.2
     assert (0.5 in world.sent) == (begins == 0.9)
-    assert world.sent[-1] == 0.0
-    assert not world.subscribed
+    assert (world.sent[-1], world.subscribed) == (0.0, False)
 
 
-def test_a_drive_whose_end_passed_during_a_stall_of_the_client_is_not_a_success(
-    monkeypatch: pytest.MonkeyPatch,
+@each(
+    ("trouble", "begins", "lasts"),
+    [
+        ("blocks", 0.0, 0.6),  # a slow subscription
+        ("stalls", 0.9, 0.8 * GRACE_S),
+        ("stalls", 1.5, 4.0),  # it only waits for the robot to stop
+    ],
+)
+def test_a_drive_outlasts_a_pause_that_does_not_matter(
+    trouble: str, begins: float, lasts: float
 ) -> None:
     world = World(followed)
-    world.stalls = 0.9, 4.0
-    with pytest.raises(NotDrivenError, match="sent no command"):
-        world.drive(monkeypatch, 1.0)
-
-
-@pytest.mark.parametrize("begins", [0.1, 0.9], ids=["opening", "driving"])
-def test_a_drive_ends_if_the_bus_accepts_no_command(
-    monkeypatch: pytest.MonkeyPatch, begins: float
-) -> None:
-    world = World(followed)
-    world.blocks = begins, 0.6
-    words = r"sent no command for 0\.[67] s.*not finished"
-    with pytest.raises(NotDrivenError, match=words):
-        world.drive(monkeypatch, 60.0)
-    assert begins + 0.6 <= world.now - 100.0 < begins + 0.8
-    assert world.sent[-1] == 0.0
-
-
-def test_a_slow_subscription_does_not_prevent_a_drive(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    world = World(followed)
-    world.blocks = 0.0, 0.6
-    world.drive(monkeypatch)
-    assert world.sent.count(0.5) in (20, 21)
-
-
-def test_a_drive_continues_after_a_short_stall(monkeypatch: pytest.MonkeyPatch) -> None:
-    world = World(followed)
-    world.stalls = 0.9, 0.8 * GRACE_S
-    assert world.drive(monkeypatch) < 2.1
+    setattr(world, trouble, (begins, lasts))
+    assert world.drive() < 2.1 + lasts
     assert world.sent.count(0.5) > 10
 
 
-def test_a_client_may_stall_while_it_only_waits_for_the_robot_to_stop(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    world = World(followed)
-    world.stalls = 1.5, 4.0
-    world.drive(monkeypatch)
-
-
-@pytest.mark.parametrize("seconds", [0.4, 1.0, 60.0])
-@pytest.mark.parametrize("dies", [0.35, 0.7, 1.0])
+@each("seconds", [0.4, 1.0, 60.0])
+@each("dies", [0.35, 0.7, 1.0])
 def test_a_stored_state_of_a_dead_robot_does_not_keep_a_drive_running(
-    monkeypatch: pytest.MonkeyPatch, seconds: float, dies: float
+    seconds: float, dies: float
 ) -> None:
     """A router's storage answers queries with the last state of a robot that is off."""
     world = World(followed)
     world.dies = dies
     with pytest.raises(NoAnswerError, match="nothing received"):
-        world.drive(monkeypatch, seconds)
+        world.drive(seconds)
     assert world.asked
-    assert world.now - 100.0 <= dies + ROBOT_SILENCE_TIMEOUT_S + 0.3
+    assert world.passed <= dies + ROBOT_SILENCE_TIMEOUT_S + 0.3
     assert world.sent[-1] == 0.0
 
 
-@pytest.mark.parametrize("last", [FOLLOWED, STOPPED, replace(FOLLOWED, sender="")])
-def test_a_stored_state_of_a_robot_that_died_long_ago_starts_no_drive(
-    monkeypatch: pytest.MonkeyPatch, last: RobotState
-) -> None:
+@each("last", [FOLLOWED, STOPPED, replace(FOLLOWED, sender="")])
+def test_a_stored_state_of_a_robot_that_died_long_ago_starts_no_drive(last: RobotState) -> None:
     world = World(followed)
     world.dies, world.stored = 0.0, sample_of(last)
     with pytest.raises(NoAnswerError, match="nothing received"):
-        world.drive(monkeypatch, 0.4)
+        world.drive(0.4)
     assert set(world.sent) == {0.0}
 
 
-def test_a_daemon_of_another_version_is_distinguished_from_a_dead_one(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    world = World(followed)
-    monkeypatch.setattr(world, "_sample", lambda: raw_sample(b"{}"))
+def test_a_daemon_of_another_version_is_distinguished_from_a_dead_one() -> None:
+    world: Any = World(followed)
+    world._sample = lambda: raw_sample(b"{}")
     with pytest.raises(NoAnswerError, match="another version"):
-        world.drive(monkeypatch)
+        world.drive()
 
 
-def test_a_closed_connection_ends_the_drive(monkeypatch: pytest.MonkeyPatch) -> None:
+def closed(*_: float) -> None:
+    raise zenoh.ZError("session closed")
+
+
+@each("call", ["try_recv", "send"])
+def test_a_closed_connection_ends_the_drive(call: str) -> None:
     world = World(followed)
-    world.set_clock(monkeypatch)
     steps = world.steps()
     next(steps)
-
-    def closed() -> None:
-        raise zenoh.ZError("closed")
-
-    monkeypatch.setattr(world, "try_recv", closed)
-    with pytest.raises(NoAnswerError, match="closed"):
-        next(steps)
-
-
-def test_a_drive_on_a_closed_connection_ends_with_a_no_answer_error(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    world = World(followed)
-    world.set_clock(monkeypatch)
-    steps = world.steps()
-    next(steps)
-
-    def closed(*_: float) -> None:
-        raise zenoh.ZError("session closed")
-
-    monkeypatch.setattr(world, "send", closed)
+    setattr(world, call, closed)
     world.now += 0.01
     with pytest.raises(NoAnswerError, match="closed"):
         next(steps)
@@ -450,7 +390,7 @@ def test_a_value_that_is_not_a_number_is_refused_before_a_command_is_sent() -> N
         drive(10**400, 0.0, 1.0)
 
 
-@pytest.mark.parametrize("seconds", [0, -1, -0.5])
+@each("seconds", [0, -1, -0.5])
 def test_a_drive_without_a_positive_duration_is_refused_before_a_command_is_sent(
     seconds: float,
 ) -> None:
@@ -487,66 +427,48 @@ def test_the_error_has_the_reason_that_the_daemon_reports(state: RobotState, wor
 # the zeros at the end of a drive that was interrupted
 
 
-def zeros_of(world: World, monkeypatch: pytest.MonkeyPatch) -> float:
-    """Send the zeros of an interrupted drive, and return how long it took, s."""
-    world.set_clock(monkeypatch)
+def zeros_of(world: World, idle_s: float | None = None) -> float:
+    """Send the zeros of a drive that was interrupted `idle_s` ago, and return how long it took."""
     robot: Any = world
-    for pause in repeat_zeros(robot):
+    for pause in repeat_zeros(robot, None if idle_s is None else world.now - idle_s):
         world.now += pause
-    return world.now - 100.0
+    return world.passed
 
 
-def test_zeros_are_repeated_until_the_state_shows_rest(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_zeros_are_repeated_until_the_state_shows_rest() -> None:
     world = World(lambda t, last, sent: replace(FOLLOWED, linear=0.3 if t < 1.0 else 0.0))
-    assert 1.0 < zeros_of(world, monkeypatch) < 1.5
+    assert 1.0 < zeros_of(world) < 1.5
     assert set(world.sent) == {0.0}
     assert len(world.sent) > 20
     assert not world.subscribed
 
 
-def test_zeros_end_early_for_a_robot_that_cannot_drive(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_zeros_end_early_for_a_robot_that_cannot_drive_or_that_is_gone() -> None:
     world = World(lambda t, last, sent: replace(STOPPED, linear=0.3))
-    assert zeros_of(world, monkeypatch) < 0.5
-
-
-def test_zeros_to_a_silent_daemon_end_after_two_seconds(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert zeros_of(world) < 0.5
     world = World(lambda t, last, sent: None)
-    assert zeros_of(world, monkeypatch) == pytest.approx(MAX_END_S, abs=0.06)
+    assert zeros_of(world) == pytest.approx(MAX_END_S, abs=0.06)
+    dead: Any = World(followed)
+    dead.send = closed
+    assert zeros_of(dead) == 0.0
 
 
-def test_a_closed_connection_gets_no_zeros(monkeypatch: pytest.MonkeyPatch) -> None:
-    world = World(followed)
-
-    def closed(linear: float, angular: float = 0.0) -> None:
-        raise zenoh.ZError("closed")
-
-    monkeypatch.setattr(world, "send", closed)
-    assert zeros_of(world, monkeypatch) == 0.0
-
-
+@each(
+    ("says", "is_sent"),
+    [
+        (lambda *_: replace(FOLLOWED, source="nav", sender=OTHER, linear=0.3), False),
+        (lambda *_: None, True),
+        (followed, True),
+    ],
+)
 def test_a_sender_that_was_idle_sends_no_zero_if_the_robot_follows_another_source(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    world = World(lambda t, last, sent: replace(FOLLOWED, source="nav", sender=OTHER, linear=0.3))
-    world.set_clock(monkeypatch)
-    robot: Any = world
-    for pause in repeat_zeros(robot, world.now - 2 * GRACE_S):
-        world.now += pause
-    assert world.sent == []
-    assert not world.subscribed
-
-
-@pytest.mark.parametrize("says", [lambda t, last, sent: None, followed])
-def test_a_sender_that_was_idle_sends_zeros_if_the_robot_follows_it_or_is_silent(
-    says: Says, monkeypatch: pytest.MonkeyPatch
+    says: Says, is_sent: bool
 ) -> None:
     world = World(says)
-    world.set_clock(monkeypatch)
     world.now += 1.0
-    robot: Any = world
-    for pause in repeat_zeros(robot, world.now - 2 * GRACE_S):
-        world.now += pause
-    assert set(world.sent) == {0.0}
+    zeros_of(world, 2 * GRACE_S)
+    assert set(world.sent) == ({0.0} if is_sent else set())
+    assert not world.subscribed
 
 
 # courses by the odometry
@@ -566,43 +488,39 @@ class WithOdometry(World):
         queue: list[Any] = []
 
         def receive() -> Any:
-            if not queue and self.now - 100.0 < self._odometry_s:
+            if not queue and self.passed < self._odometry_s:
                 queue.extend([sample_of(self.body.odom(), "acsard/acsar/odom"), None])
             return queue.pop(0) if queue else None
 
         return SimpleNamespace(try_recv=receive, undeclare=lambda: None)
 
-    def move(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        self.set_clock(monkeypatch)
+    def move(self) -> None:
         robot: Any = self
         for pause in move(1.0, 0.3)(Driver(robot)):
             self.now += pause
 
 
-def test_a_move_without_odometry_ends_before_it_began(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_move_without_odometry_ends_before_it_began() -> None:
     world = WithOdometry(0.0)
     with pytest.raises(NoAnswerError, match="no odometry arrives"):
-        world.move(monkeypatch)
+        world.move()
     assert world.sent == []
 
 
-def test_a_move_stops_when_the_odometry_falls_silent(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_move_stops_when_the_odometry_falls_silent() -> None:
     world = WithOdometry(1.0)
     with pytest.raises(NoAnswerError, match="no odometry arrives"):
-        world.move(monkeypatch)
-    zeros = next(n for n, speed in enumerate(reversed(world.sent)) if speed)
+        world.move()
     assert 0.3 in world.sent
     # The error comes 2 s after the last message, and zeros from 0.2 s after it until rest.
-    assert zeros >= 10
+    assert next(n for n, speed in enumerate(reversed(world.sent)) if speed) >= 10
 
 
-def test_a_move_of_a_robot_that_does_not_move_ends_after_three_seconds(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_a_move_of_a_robot_that_does_not_move_ends_after_three_seconds() -> None:
     world = WithOdometry(60.0)
     with pytest.raises(NotDrivenError, match=r"no nearer for 3 s, and 1\.000 m is left"):
-        world.move(monkeypatch)
-    assert 3.0 < world.now - 100.0 < 4.0
+        world.move()
+    assert 3.0 < world.passed < 4.0
 
 
 class Rolling(WithOdometry):
@@ -616,11 +534,8 @@ class Rolling(WithOdometry):
         super().send(linear, angular)
         self.linear, self.angular = linear, angular
 
-    def follow(
-        self, monkeypatch: pytest.MonkeyPatch, steps: Steps, is_set: float = math.inf
-    ) -> None:
+    def follow(self, steps: Steps, is_set: float = math.inf) -> None:
         """Drive a course, for at most 1000 s. After `is_set` s, the odometry is reset."""
-        self.set_clock(monkeypatch)
         robot: Any = self
         body = self.body
         for pause in steps(Driver(robot)):
@@ -631,33 +546,33 @@ class Rolling(WithOdometry):
             body.x += self.linear * math.cos(body.yaw) * pause
             body.y += self.linear * math.sin(body.yaw) * pause
             body.yaw += self.angular * pause
-            if self.now - 100.0 >= is_set:
+            if self.passed >= is_set:
                 body.x, body.y, body.yaw, is_set = 0.0, 0.0, 0.0, math.inf
 
 
-def test_a_long_way_at_a_low_speed_is_driven_to_its_end(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_long_way_at_a_low_speed_is_driven_to_its_end() -> None:
     world = Rolling()
-    world.follow(monkeypatch, move(20.0, 0.05))
+    world.follow(move(20.0, 0.05))
     assert world.way == pytest.approx(20.0, abs=0.01)
     world = Rolling()
-    world.follow(monkeypatch, turn(3600.0, 0.2))
+    world.follow(turn(3600.0, 0.2))
     assert world.turned == pytest.approx(20 * math.pi, abs=0.02)
 
 
-def test_a_course_ends_if_the_pose_is_set_on_the_way(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_course_ends_if_the_pose_is_set_on_the_way() -> None:
     # From (3, -2) to (0, 0): the robot would drive 4.5 m in place of 1 m.
     world = Rolling()
     with pytest.raises(NotDrivenError, match="the pose was set"):
-        world.follow(monkeypatch, move(1.0, 0.3), is_set=2.0)
+        world.follow(move(1.0, 0.3), is_set=2.0)
     assert world.way < 0.7
     world = Rolling()
     world.body.x, world.body.y, world.body.yaw = 0.0, 0.0, 2.0
     with pytest.raises(NotDrivenError, match="the pose was set"):
-        world.follow(monkeypatch, turn(90.0, 0.8), is_set=1.0)
+        world.follow(turn(90.0, 0.8), is_set=1.0)
     assert world.turned < 1.0
 
 
-@pytest.mark.parametrize("speed", [0.0, -0.3])
+@each("speed", [0.0, -0.3])
 def test_a_move_needs_a_speed_above_zero(speed: float) -> None:
     with pytest.raises(UsageError, match=f"speed = {speed:g}: it must be above 0"):
         move(-1.0, speed)

@@ -20,7 +20,7 @@ from acsard.client.follower import (
     restarted,
 )
 from acsard.core.messages.schema import RobotState, Time
-from tests.unit.top.screens import BEFORE, STATE, raw_sample, sample_of
+from tests.unit.screens import BEFORE, STATE, raw_sample, sample_of
 
 TICK = 0.01
 

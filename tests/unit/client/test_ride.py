@@ -17,7 +17,7 @@ from acsard.client.ride import (
 from acsard.core.messages.schema import RobotState, SourceState
 from acsard.core.values import REST, Twist
 from tests.each import each
-from tests.unit.top.screens import STATE
+from tests.unit.screens import STATE
 
 OURS, RELEASED = "joe/1/aa", 100.0
 AHEAD, LEFT = Twist(0.5, 0.0), Twist(0.0, 1.0)

@@ -15,7 +15,7 @@ from acsard.bus.address import Address
 from acsard.host.errors import MendableError
 from acsard.machine import upgrade, versions
 from acsard.machine.upgrade import Look, UnitState, configuration_file, prepare, worse
-from tests.unit.top.screens import STATE
+from tests.unit.screens import STATE
 
 
 def seen(

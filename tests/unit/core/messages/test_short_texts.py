@@ -23,7 +23,7 @@ from acsard.core.messages.schema import (
 )
 from acsard.core.messages.short_texts import place, short, speeds
 from tests.each import each
-from tests.unit.top.screens import STATE
+from tests.unit.screens import STATE
 
 HEADER = Header(Time(), "odom")
 

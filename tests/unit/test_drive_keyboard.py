@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, cast
 
 import pytest
 from hypothesis import given
@@ -18,6 +18,7 @@ from acsard.client.ride import GRACE_S, MAX_SOURCE_TIMEOUT_S, RELEASE_TIMEOUT_S
 from acsard.core.messages.schema import RobotState, SourceState
 from acsard.core.values import NS_PER_S, REST, Twist
 from acsard.host import clock
+from acsard.top.drive_screen import Teleop
 from acsard.top.keyboard import (
     KEY_HOLD_S,
     RELEASE_REASON,
@@ -26,8 +27,9 @@ from acsard.top.keyboard import (
     KeyboardDrive,
     split,
 )
+from acsard.top.terminal import print_last_report
 from tests.each import each
-from tests.unit.top.screens import STATE, sample_of
+from tests.unit.screens import STATE, sample_of
 
 UP, DOWN, RIGHT, LEFT = "\x1b[A", "\x1b[B", "\x1b[C", "\x1b[D"
 
@@ -51,32 +53,15 @@ def pressed(key: str, now: float) -> Keyboard:
     return keys
 
 
-def test_nothing_is_wished_before_the_first_key() -> None:
-    assert Keyboard(0.5, 2.0).wish(10.0) is None
-
-
 @each(("key", "linear", "angular"), MOVES)
-def test_each_key_drives_in_its_direction(key: str, linear: int, angular: int) -> None:
-    keys = pressed(key, 10.0)
-    assert keys.wish(10.0) == Twist(0.5 * linear, 2.0 * angular)
-
-
-def test_a_press_drives_for_its_hold() -> None:
-    keys = pressed("i", 10.0)
-    assert keys.wish(10.0 + KEY_HOLD_S - 0.001) == Twist(0.5, 0.0)
-    assert keys.wish(10.0 + KEY_HOLD_S) is None
-
-
-def test_the_hold_is_longer_than_the_delay_of_a_keyboard_and_no_longer_than_a_second() -> None:
+def test_each_key_drives_in_its_direction_for_its_hold(key: str, linear: int, angular: int) -> None:
+    assert Keyboard(0.5, 2.0).wish(10.0) is None
+    # Longer than the delay of a keyboard before the first repeat.
     assert 0.5 < KEY_HOLD_S <= 1.0
-
-
-def test_a_repeated_press_extends_the_hold() -> None:
-    keys = pressed("i", 10.0)
-    for n in range(20):
-        keys.press("i", 10.0 + n * 0.5)
-        assert keys.wish(10.0 + n * 0.5 + 0.499) == Twist(0.5, 0.0)
-    assert keys.wish(19.5 + KEY_HOLD_S) is None
+    keys, twist = pressed(key, 10.0), Twist(0.5 * linear, 2.0 * angular)
+    for at in (10.0, 10.0 + KEY_HOLD_S - 0.001):
+        assert keys.wish(at) == twist
+    assert keys.wish(10.0 + KEY_HOLD_S) is None
 
 
 @each(("delay", "hz"), [(0.25, 30.0), (0.5, 30.0), (0.5, 10.9), (0.25, 5.0)])
@@ -92,10 +77,12 @@ def test_a_held_key_drives_without_a_break_and_stops_soon_after_its_release(
     assert keys.wish(last + REPEAT_S) is None
 
 
-def test_two_taps_are_no_held_key() -> None:
+@each("pause", [0.15, 0.5])
+def test_taps_are_no_held_key(pause: float) -> None:
     keys = pressed("i", 10.0)
-    keys.press("i", 10.15)
-    assert keys.wish(10.15 + KEY_HOLD_S - 0.001) == Twist(0.5, 0.0)
+    keys.press("i", 10.0 + pause)
+    assert keys.wish(10.0 + pause + KEY_HOLD_S - 0.001) == Twist(0.5, 0.0)
+    assert keys.wish(10.0 + pause + KEY_HOLD_S) is None
 
 
 def test_another_key_changes_the_direction_immediately() -> None:
@@ -107,14 +94,9 @@ def test_another_key_changes_the_direction_immediately() -> None:
 
 @each("key", [" ", "k", "p", "\x1b", "\x1b[H", "I", "\n", "�", ""])
 def test_any_other_key_stops_immediately(key: str) -> None:
-    keys = pressed("i", 10.0)
-    keys.press(key, 10.1)
-    assert [keys.wish(10.1) for _ in range(3)] == [REST, None, None]
-
-
-def test_a_stop_at_rest_is_a_zero_too() -> None:
-    keys = pressed(" ", 10.0)
-    assert [keys.wish(10.0) for _ in range(2)] == [REST, None]
+    for keys in (pressed("i", 10.0), Keyboard(0.5, 2.0)):  # at rest, too
+        keys.press(key, 10.1)
+        assert [keys.wish(10.1) for _ in range(3)] == [REST, None, None]
 
 
 @each(("key", "linear", "angular"), SPEEDS)
@@ -137,16 +119,12 @@ def test_a_speed_key_while_driving_acts_immediately_and_does_not_extend_the_hold
     ("text", "keys"),
     [
         ("", []),
-        ("i", ["i"]),
         ("iii", ["i", "i", "i"]),
-        (UP, [UP]),
         (UP + UP, [UP, UP]),
         ("i" + LEFT + "k", ["i", LEFT, "k"]),
-        ("\x1b", ["\x1b"]),
         ("\x1bi", ["\x1b", "i"]),
         ("\x1b[", ["\x1b["]),
         ("\x1b" + RIGHT, ["\x1b", RIGHT]),
-        ("�,", ["�", ","]),
     ],
 )
 def test_terminal_input_is_split_into_keys(text: str, keys: list[str]) -> None:
@@ -158,11 +136,6 @@ def test_the_split_into_keys_loses_no_character(text: str) -> None:
     keys = split(text)
     assert "".join(keys) == text
     assert all(len(key) == 1 or key.startswith("\x1b[") for key in keys)
-
-
-@given(st.lists(st.sampled_from([*"io,k ", UP, DOWN, LEFT, RIGHT])))
-def test_whole_keys_come_back_as_they_were(keys: list[str]) -> None:
-    assert split("".join(keys)) == keys
 
 
 # the robot's published state
@@ -211,12 +184,13 @@ class Robot:
 class Drive:
     """A keyboard drive with a clock that the test sets, and its robot."""
 
-    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+    newest: Drive
+
+    def __init__(self) -> None:
+        Drive.newest = self
         self.now, self.asleep = 100.0, 0.0
         robot: Any = Robot()
         self.robot = robot
-        monkeypatch.setattr(clock, "mono_ns", lambda: round((self.now - self.asleep) * NS_PER_S))
-        monkeypatch.setattr(clock, "asleep_ns", lambda: round(self.asleep * NS_PER_S))
         self.ride = KeyboardDrive(self.robot, Keyboard(0.5, 2.0))
 
     def step(self, typed: str = "", times: int = 1) -> list[float]:
@@ -228,21 +202,47 @@ class Drive:
             self.now += 0.05
         return list(self.robot.sent[sent:])
 
+    def for_s(self, typed: str, seconds: float) -> list[float]:
+        return self.step(typed, round(seconds / 0.05))
 
-@pytest.fixture
-def drive(monkeypatch: pytest.MonkeyPatch) -> Drive:
-    return Drive(monkeypatch)
+    def drives(self, typed: str, times: int = 20) -> bool:
+        """Type this text at each step, and return whether the drive sends a speed."""
+        return any(self.step(typed, times))
+
+    @property
+    def objection(self) -> str:
+        return self.ride.screen_data().objection
 
 
-def test_only_a_drive_after_a_silence_is_led_by_a_zero(drive: Drive) -> None:
+@pytest.fixture(autouse=True)
+def _clock(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let the clocks show the time of the newest drive."""
+
+    def wait(seconds: float) -> None:
+        Drive.newest.now += seconds
+
+    monkeypatch.setattr(time, "sleep", wait)
+    of = Drive
+    monkeypatch.setattr(clock, "asleep_ns", lambda: round(of.newest.asleep * NS_PER_S))
+    monkeypatch.setattr(
+        clock, "mono_ns", lambda: round((of.newest.now - of.newest.asleep) * NS_PER_S)
+    )
+
+
+def test_only_a_drive_after_a_silence_is_led_by_a_zero_and_a_space_stops_at_the_next_step() -> None:
+    drive = Drive()
     assert drive.step(times=40) == []
     assert drive.step("i", times=3) == [0.0, 0.5, 0.5]
     assert drive.step("m") == [-0.5]
+    assert drive.step(" ") == [0.0]
 
 
-def test_a_zero_is_repeated_until_the_state_shows_that_the_robot_rests(drive: Drive) -> None:
+def test_a_zero_is_repeated_until_the_state_shows_that_the_robot_rests() -> None:
+    drive = Drive()
     drive.step("i", times=5)
     assert drive.step("k", times=18) == [0.0] * 18
+    assert drive.step("m", times=2) == [-0.5, -0.5]  # a key drives meanwhile
+    drive.step("k", times=18)
     drive.robot.shows = RESTING
     drive.step()
     assert drive.step(times=100) == []
@@ -250,41 +250,29 @@ def test_a_zero_is_repeated_until_the_state_shows_that_the_robot_rests(drive: Dr
     assert drive.step() == []
 
 
-def test_a_zero_is_not_repeated_for_longer_than_the_longest_timeout(drive: Drive) -> None:
+def test_a_zero_is_not_repeated_for_longer_than_the_longest_timeout() -> None:
+    drive = Drive()
     drive.step("i", times=3)
     drive.robot.shows = None
-    drive.step("k", times=round(MAX_SOURCE_TIMEOUT_S / 0.05) - 20)
+    drive.for_s("k", MAX_SOURCE_TIMEOUT_S - 1.0)
     assert drive.step(times=10) == [0.0] * 10
     drive.step(times=40)
     assert drive.step(times=100) == []
 
 
-def test_a_key_drives_while_the_zero_is_repeated(drive: Drive) -> None:
-    drive.step("i", times=3)
-    assert set(drive.step("k", times=10)) == {0.0}
-    assert drive.step("m", times=2) == [-0.5, -0.5]
-
-
-def test_a_drive_that_ends_repeats_its_zero_for_two_seconds_at_most(
-    drive: Drive, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def wait(seconds: float) -> None:
-        drive.now += seconds
-
-    monkeypatch.setattr(time, "sleep", wait)
+def test_a_drive_that_ends_repeats_its_zero_for_two_seconds_at_most() -> None:
+    drive = Drive()
     drive.step("i", times=3)
     sent, begun = len(drive.robot.sent), drive.now
     drive.ride.end()
     assert drive.now - begun == pytest.approx(MAX_END_S, abs=0.06)
-    assert drive.robot.sent[sent:] == [0.0] * len(drive.robot.sent[sent:])
+    assert set(drive.robot.sent[sent:]) == {0.0}
     assert len(drive.robot.sent[sent:]) == pytest.approx(41, abs=1)
 
 
 @each("key", ["i", UP])
-def test_keys_that_a_stalled_connection_held_back_do_not_drive(
-    key: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    drive = Drive(monkeypatch)
+def test_keys_that_a_stalled_connection_held_back_do_not_drive(key: str) -> None:
+    drive = Drive()
     drive.step("i", times=5)
     waited = 151 * key
     reads = [waited[at : at + 64] for at in range(0, len(waited), 64)]  # as a terminal gives them
@@ -300,10 +288,10 @@ def test_keys_that_a_stalled_connection_held_back_do_not_drive(
 @each("asleep", [60.0, 0.0])
 @each("reads", [[""], ["i"], [8 * "i"], [64 * "i", "ii"]])
 def test_a_key_that_was_pressed_before_or_in_a_stall_does_not_drive_after_it(
-    reads: list[str], asleep: float, monkeypatch: pytest.MonkeyPatch
+    reads: list[str], asleep: float
 ) -> None:
     """The computer is suspended for `asleep` s of the stall. Keys are typed during the stall."""
-    drive = Drive(monkeypatch)
+    drive = Drive()
     drive.step("i", times=5)
     sent = len(drive.robot.sent)
     drive.now += 60.0
@@ -316,29 +304,25 @@ def test_a_key_that_was_pressed_before_or_in_a_stall_does_not_drive_after_it(
     assert drive.step("i", times=4)[-1] == 0.5
 
 
-def test_a_press_does_not_drive_for_the_rest_of_its_hold_after_a_stall(drive: Drive) -> None:
+def test_a_press_does_not_drive_for_the_rest_of_its_hold_after_a_stall() -> None:
+    drive = Drive()
     drive.step("i", times=3)
     drive.now += (GRACE_S + KEY_HOLD_S) / 2
     assert drive.step(times=10) == [0.0] * 10
 
 
-def test_a_stall_without_a_key_sends_nothing(drive: Drive) -> None:
+def test_a_stall_without_a_key_sends_nothing_and_a_key_drives_after_a_short_one() -> None:
     """A zero would stop another program that drives as the same source."""
+    drive = Drive()
     drive.step(times=10)
     drive.now += 60.0
     assert drive.step(times=10) == []
-
-
-def test_a_key_drives_after_a_short_stall(drive: Drive) -> None:
-    drive.step(times=10)
     drive.now += 0.8 * GRACE_S
     assert drive.step("i", times=2)[-1] == 0.5
 
 
-def test_the_first_key_drives_however_long_the_bus_took_to_subscribe(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    drive = Drive(monkeypatch)
+def test_the_first_key_drives_however_long_the_bus_took_to_subscribe() -> None:
+    drive = Drive()
 
     class Slow(Robot):
         def subscribe(self, name: str) -> Any:
@@ -350,16 +334,19 @@ def test_the_first_key_drives_however_long_the_bus_took_to_subscribe(
     assert drive.step("i", times=2) == [0.0, 0.5]
 
 
-def test_a_key_drives_no_robot_that_does_not_publish_its_state(drive: Drive) -> None:
+def test_a_key_drives_no_robot_whose_daemon_is_silent() -> None:
+    drive = Drive()
     drive.robot.shows = None
-    assert set(drive.step("i", times=100)) == {0.0}
-
-
-def test_a_held_key_stops_the_robot_when_the_daemon_falls_silent(drive: Drive) -> None:
+    assert not drive.drives("i", 100)
+    drive = Drive()
     assert drive.step("i", times=20)[-1] == 0.5
+    assert not drive.ride.screen_data().silent
     drive.robot.shows = None
-    assert drive.step("i", times=round(ROBOT_SILENCE_TIMEOUT_S / 0.05) + 3)[-1] == 0.0
+    assert drive.for_s("i", ROBOT_SILENCE_TIMEOUT_S + 0.15)[-1] == 0.0
+    assert drive.ride.screen_data().silent
 
+
+# a held key that the robot does not follow
 
 NOT_FOLLOWING = [
     *(replace(STOPPED, mode=mode) for mode in ("stopped", "fault", "inactive")),
@@ -367,116 +354,91 @@ NOT_FOLLOWING = [
 ]
 
 
-class HeldKeyDrive(Drive):
-    """A keyboard drive with a held key. A state then shows why the robot does not obey it."""
-
-    def __init__(self, why: RobotState, monkeypatch: pytest.MonkeyPatch) -> None:
-        super().__init__(monkeypatch)
-        self.step(times=5)
-        assert self.step("i", times=20)[-1] == 0.5
-        self.robot.shows = why
-        self.step("i")
-
-    def drives(self, typed: str, times: int = 20) -> bool:
-        """Type this text at each step, and return whether the drive sends a speed."""
-        return any(self.step(typed, times))
+def held(why: RobotState) -> Drive:
+    """Return a drive with a held key. A state then shows why the robot does not obey it."""
+    drive = Drive()
+    drive.step(times=5)
+    assert drive.step("i", times=20)[-1] == 0.5
+    drive.robot.shows = why
+    drive.step("i")
+    return drive
 
 
 @each("why", NOT_FOLLOWING)
 @each("pause", [0.0, 0.4, 1.0])
 def test_a_key_that_is_held_while_the_robot_ceases_to_follow_does_not_drive_after_a_pause(
-    why: RobotState, pause: float, monkeypatch: pytest.MonkeyPatch
+    why: RobotState, pause: float
 ) -> None:
-    keyboard = HeldKeyDrive(why, monkeypatch)
-    assert not keyboard.drives("i")
-    keyboard.robot.shows = FOLLOWED
-    assert not keyboard.drives("", round(pause / 0.05))
-    assert not keyboard.drives("i")
+    drive = held(why)
+    assert not drive.drives("i")
+    drive.robot.shows = FOLLOWED
+    assert not drive.drives("", round(pause / 0.05))
+    assert not drive.drives("i")
 
 
 @each("mode", ["waiting", "ready"])
 def test_a_held_key_drives_on_after_a_short_time_without_effect_but_not_after_a_long_one(
-    mode: str, monkeypatch: pytest.MonkeyPatch
+    mode: str,
 ) -> None:
     """The link to the board, or a source with a higher priority, comes and goes."""
-    keyboard = HeldKeyDrive(replace(FOLLOWED, mode=mode, source=""), monkeypatch)
-    assert keyboard.drives("i", round(GRACE_S / 0.05) - 4)
-    keyboard.robot.shows = FOLLOWED
-    assert keyboard.drives("i")
-    keyboard.robot.shows = replace(FOLLOWED, mode=mode, source="")
-    keyboard.step("i", round(GRACE_S / 0.05) + 2)
-    keyboard.robot.shows = FOLLOWED
-    assert not keyboard.drives("i")
+    away = replace(FOLLOWED, mode=mode, source="")
+    drive = held(away)
+    assert any(drive.for_s("i", GRACE_S - 0.2))
+    drive.robot.shows = FOLLOWED
+    assert drive.drives("i")
+    drive.robot.shows = away
+    drive.for_s("i", GRACE_S + 0.1)
+    drive.robot.shows = FOLLOWED
+    assert not drive.drives("i")
 
 
-def test_delayed_keys_do_not_release_a_key_that_no_longer_drives(
-    monkeypatch: pytest.MonkeyPatch,
+def test_delayed_keys_do_not_release_a_key_that_no_longer_drives() -> None:
+    drive = held(STOPPED)
+    drive.robot.shows = FOLLOWED
+    drive.step(times=60)
+    drive.step(45 * "i")
+    assert not drive.drives("i", 40)
+
+
+def test_a_delayed_space_does_not_release_a_key_that_no_longer_drives() -> None:
+    """The key is held before and after a stall. Only a space that arrives in time releases it."""
+    drive = held(STOPPED)
+    drive.robot.shows = FOLLOWED
+    drive.step("i", times=10)
+    drive.now += 1.2 * GRACE_S
+    assert not drive.drives(" ", 1)
+    assert not drive.drives("", 5)
+    assert not drive.drives("i")
+    drive.step(" ")
+    assert drive.drives("i")
+
+
+def test_delayed_keys_do_not_drive_if_the_robot_was_stopped_late_in_their_delay() -> None:
+    """The connection stalls for 3 s while a key is held. After 2 s, a stop and a clear come."""
+    drive = held(FOLLOWED)
+    drive.step("i", times=10)
+    drive.step(times=40)
+    drive.robot.shows = STOPPED
+    drive.step(times=2)
+    drive.robot.shows = FOLLOWED
+    drive.step(times=18)
+    drive.step(90 * "i")
+    assert not drive.drives("i", 40)
+
+
+@each(("key", "seconds"), [(" ", 0.05), ("k", 0.05), ("", REPEAT_S + RELEASE_TIMEOUT_S + 0.1)])
+def test_a_key_that_no_longer_drives_does_so_after_a_stop_or_its_release(
+    key: str, seconds: float
 ) -> None:
-    keyboard = HeldKeyDrive(STOPPED, monkeypatch)
-    keyboard.robot.shows = FOLLOWED
-    keyboard.step(times=60)
-    keyboard.step(45 * "i")
-    assert not keyboard.drives("i", 40)
+    drive = held(ZERO_FIRST)
+    drive.step("i", times=10)
+    drive.robot.shows = FOLLOWED
+    drive.for_s(key, seconds)
+    assert drive.step("i", times=4)[-2:] == [0.5, 0.5]
 
 
-def test_a_delayed_space_does_not_release_a_key_that_no_longer_drives(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    """The key is held before and after a stall.
-
-    Only a space that arrives in time releases the key.
-    """
-    keyboard = HeldKeyDrive(STOPPED, monkeypatch)
-    keyboard.robot.shows = FOLLOWED
-    keyboard.step("i", times=10)
-    keyboard.now += 1.2 * GRACE_S
-    assert not keyboard.drives(" ", 1)
-    assert not keyboard.drives("", 5)
-    assert not keyboard.drives("i")
-    keyboard.step(" ")
-    assert keyboard.drives("i")
-
-
-def test_delayed_keys_do_not_drive_if_the_robot_was_stopped_late_in_their_delay(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    """The connection stalls for 3 s while a key is held.
-
-    After 2 s the robot is stopped and cleared.
-    """
-    keyboard = HeldKeyDrive(FOLLOWED, monkeypatch)
-    keyboard.step("i", times=10)
-    keyboard.step(times=40)
-    keyboard.robot.shows = STOPPED
-    keyboard.step(times=2)
-    keyboard.robot.shows = FOLLOWED
-    keyboard.step(times=18)
-    keyboard.step(90 * "i")
-    assert not keyboard.drives("i", 40)
-
-
-@each("key", [" ", "k"])
-def test_a_key_that_no_longer_drives_does_so_after_a_key_that_stops(
-    key: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    keyboard = HeldKeyDrive(ZERO_FIRST, monkeypatch)
-    keyboard.step("i", times=10)
-    keyboard.step(key)
-    keyboard.robot.shows = FOLLOWED
-    assert keyboard.step("i", times=3)[-2:] == [0.5, 0.5]
-
-
-def test_a_key_that_no_longer_drives_does_so_after_its_release(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    keyboard = HeldKeyDrive(ZERO_FIRST, monkeypatch)
-    keyboard.step("i", times=10)
-    keyboard.robot.shows = FOLLOWED
-    keyboard.step(times=round((REPEAT_S + RELEASE_TIMEOUT_S) / 0.05) + 2)
-    assert keyboard.step("i", times=4)[-2:] == [0.5, 0.5]
-
-
-def test_a_state_from_before_a_press_does_not_end_the_hold(drive: Drive) -> None:
+def test_a_state_from_before_a_press_does_not_end_the_hold() -> None:
+    drive = Drive()
     drive.robot.shows = STOPPED
     drive.step(times=50)
     drive.step("i", times=2)
@@ -484,37 +446,51 @@ def test_a_state_from_before_a_press_does_not_end_the_hold(drive: Drive) -> None
     assert drive.step("i", times=20)[-1] == 0.5
 
 
-def test_the_operator_is_informed_that_a_held_key_no_longer_drives(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    keyboard = HeldKeyDrive(STOPPED, monkeypatch)
-    keyboard.step("i", times=12)
-    assert keyboard.ride.screen_data().objection == "stopped by request"
-    keyboard.robot.shows = replace(FOLLOWED, mode="ready", source="")
-    keyboard.step("i", times=12)
-    assert keyboard.ride.screen_data().objection == RELEASE_REASON
-    assert "press space, then press the key again" in RELEASE_REASON
-    keyboard.step(" ")
-    assert keyboard.ride.screen_data().objection == ""
-
-
-def test_a_space_stops_at_the_next_step(drive: Drive) -> None:
-    drive.step("i", times=5)
-    drive.step(" ")
-    assert drive.robot.sent[-2:] == [0.5, 0.0]
-
-
-def test_the_operator_is_informed_that_a_robot_is_silent(drive: Drive) -> None:
-    drive.step("i")
-    assert not drive.ride.screen_data().silent
-    drive.now += ROBOT_SILENCE_TIMEOUT_S
-    assert drive.ride.screen_data().silent
-
-
-def test_the_operator_is_informed_why_keys_have_no_effect(drive: Drive) -> None:
+def test_the_operator_is_told_why_keys_have_no_effect_and_what_a_held_key_needs() -> None:
+    drive = Drive()
     drive.robot.shows = STOPPED
     drive.step(times=10)
-    drive.step("i", times=round(GRACE_S / 0.05) - 2)
-    assert drive.ride.screen_data().objection == ""
-    drive.step("i", times=4)
-    assert drive.ride.screen_data().objection == "stopped by request"
+    drive.for_s("i", GRACE_S - 0.1)
+    assert drive.objection == ""
+    drive.step("i", times=12)
+    assert drive.objection == "stopped by request"
+    drive.robot.shows = replace(FOLLOWED, mode="ready", source="")
+    drive.step("i", times=12)
+    assert drive.objection == RELEASE_REASON
+    assert "press space, then press the key again" in RELEASE_REASON
+    drive.step(" ")
+    assert drive.objection == ""
+
+
+# the last report
+
+
+class Ended:
+    """A drive that has ended. Each `take` shows the robot's next state, and then the last one."""
+
+    def __init__(self, *states: RobotState) -> None:
+        Drive()
+        self.states = list(states)
+
+    def take(self) -> None:
+        if len(self.states) > 1:
+            self.states.pop(0)
+
+    def screen_data(self) -> Teleop:
+        return Teleop("acsar", "tcp/127.0.0.1:7448", "teleop", 0.5, 1.0, self.states[0], 0.0)
+
+
+def test_the_last_report_waits_until_the_robot_no_longer_follows_the_drive(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("os.isatty", lambda _: True)
+    moving = replace(STATE, source="teleop", reason="commanded by teleop")
+    still = replace(moving, linear=0.0, angular=0.0, wheels=[0.0] * 4)
+    ready = replace(still, mode="ready", reason="waiting for a command", source="")
+    other = replace(still, reason="commanded by nav", source="nav")
+    for states, last in (
+        ((moving, moving, still, still, ready), "ready: waiting for a command"),
+        ((still, still, other, ready), "driving: commanded by nav"),
+    ):
+        print_last_report(cast(KeyboardDrive, Ended(*states)))
+        assert f"drive ended: the robot stands still; {last}" in capsys.readouterr().out

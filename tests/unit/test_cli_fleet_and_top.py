@@ -1,136 +1,38 @@
-"""Each robot has a line that says what it does and when it was last seen, and fits the terminal."""
+"""`acsard fleet` and `acsard top` follow robots: who is there, who is silent, and since when."""
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable, Collection, Sequence
 from itertools import count
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, cast
 
 import pytest
 import zenoh
-from hypothesis import given
-from hypothesis import strategies as st
 from msgspec.structs import replace
-from rich.cells import cell_len
+from rich.console import Console
 
 from acsard.bus.address import Address
+from acsard.bus.subscription import Subscription
 from acsard.client import fleet as fleets
+from acsard.client.connection import Connection
 from acsard.client.fleet import Row
-from acsard.client.follower import FLEET_QUERY_PERIOD_S
-from acsard.core.messages.schema import Time
+from acsard.client.follower import (
+    FIRST_STATE_TIMEOUT_S,
+    FLEET_QUERY_PERIOD_S,
+    ROBOT_SILENCE_TIMEOUT_S,
+)
+from acsard.core.messages.encodings import DecodeError
+from acsard.core.messages.schema import Info, RobotState, Time
 from acsard.core.values import NS_PER_S
 from acsard.host import clock as clocks
-from acsard.top.fleet_table import COLUMNS, Roster
-from acsard.top.fleet_table import table as table_of
-from tests.each import each
-from tests.unit.top.screens import STATE, drawn, sample_of
-
-
-def table(rows: Sequence[Row], width: int, most: int | None = None) -> list[str]:
-    return [line.rstrip() for line in drawn(table_of(rows, width, most), width).splitlines()]
-
-
-ROW = Row("robot1", True, replace(STATE, reason="commanded by app"), 0.1)
-
-
-def test_a_version_with_a_lower_number_than_the_newest_in_the_table_is_marked_as_older() -> None:
-    versions = {
-        "r1": "0.2.0.dev0+g1a2b3c4d5", "r2": "0.2.0", "r3": "0.10.0rc1", "r4": "0.10.0rc1+g1.dirty",
-        "r5": "unreadable", "r6": "",
-    }  # fmt: skip
-    rows = [Row(name, True, replace(STATE, version=text), 0.1) for name, text in versions.items()]
-    lines = table([*rows, Row("r7", True, None, 0.1)], 200)[1:]
-    assert {line[:2] for line in lines if " older " in line} == {"r1", "r2"}
-
-
-READY = replace(STATE, mode="ready", reason="waiting for a command", linear=0.0)
-DIFFER = "limits.linear_speed = 0.8, not 1.0"
-FULL = "the disk is full: nothing is recorded"
-
-
-def test_the_details_of_each_warning_follow_the_list_of_warnings() -> None:
-    expiry = "expires in 10 days (certificate of the authority)"
-    state = replace(
-        READY,
-        recording_error=FULL,
-        certificate="expires",
-        certificate_days=10.0,
-        certificate_expiry=expiry,
-        settings_differ=DIFFER,
-    )
-    (_, line) = table([replace(ROW, state=state)], 400)
-    assert line.endswith(
-        "WARNING: certificate expires in 10 days, recording fails, settings differ; waiting for a "
-        f"command; certificate: {expiry}; "
-        f"recording: {FULL}; settings: {DIFFER}"
-    )
-
-
-@each("width", [40, 60, 80, 100, 120, 200])
-def test_a_narrow_terminal_has_fewer_columns_but_mode_and_reason(width: int) -> None:
-    rows = [replace(ROW, state=replace(READY, recording_error=FULL))]
-    head, line = table(rows, width)
-    assert head.split() == [c for c, least in COLUMNS.items() if width >= least and c != "BATTERY"]
-    assert line.startswith("robot1  ready")
-    assert "WARNING: rec" in line
-    assert len(line) <= width
-
-
-@each("width", [40, 80, 160])
-@each(
-    "ids",
-    [
-        ("warehouse-west-1", "warehouse-west-2"),
-        ("1-of-the-robots-in-the-warehouse", "2-of-the-robots-in-the-warehouse"),
-        ("robots-in-the-warehouse-west-0-1", "robots-in-the-warehouse-west-0-2"),
-        ("left-robot-of-the-warehouse-west", "left-robot-of-the-warehouse-east"),
-        ("warehouse1-of-the-north-and-west", "warehouse2-of-the-north-and-west"),
-    ],
-)
-def test_two_robots_look_different_at_every_width(ids: tuple[str, str], width: int) -> None:
-    lines = table(rows_of(*ids), width)[1:]
-    assert all(len(line) <= width for line in lines)
-    names = "".join(line[: max(map(len, ids))].split()[0] for line in lines)
-    assert names == "".join(sorted(ids))
-
-
-def rows_of(*ids: str) -> list[Row]:
-    return [replace(ROW, robot_id=robot_id) for robot_id in ids]
-
-
-IN_NEED = {
-    "fault": replace(ROW, state=replace(STATE, mode="fault", reason="a wheel is stuck")),
-    "stopped": replace(ROW, state=replace(STATE, mode="stopped", reason="stopped by request")),
-    "gone": replace(ROW, here=False, age=90.0),
-    "silent": replace(ROW, age=7.0, silent=True),
-    "not there": replace(ROW, state=None, here=False),
-}
-
-
-@each("need", IN_NEED)
-def test_a_robot_that_needs_help_is_shown_first_if_the_fleet_exceeds_the_screen(need: str) -> None:
-    rows = [replace(ROW, robot_id=f"robot{n:02d}") for n in range(29)]
-    lines = table([*rows, replace(IN_NEED[need], robot_id="robot99")], 120, 20)
-    assert lines[1].startswith("robot99")
-    assert [line.split()[0] for line in lines[2:-1]] == [row.robot_id for row in rows[:19]]
-
-
-def test_more_robots_than_lines_are_counted() -> None:
-    rows = [replace(ROW, robot_id=f"robot{n}") for n in range(10)]
-    lines = table(rows, 80, 3)
-    assert len(lines) == 5
-    assert lines[-1] == "and 7 more"
-
-
-@given(st.text(max_size=80), st.floats(), st.floats(0, 1e12), st.integers(20, 200))
-def test_any_text_and_number_fits_the_width_and_is_printable(
-    text: str, number: float, age: float, width: int
-) -> None:
-    state = replace(STATE, mode=text, reason=text, link=text, linear=number, version=text)
-    for line in table([Row(text, True, state, age)], width):
-        assert cell_len(line) <= width
-        assert line.isprintable()
+from acsard.host.errors import ReplyError
+from acsard.top import feed as top_feed
+from acsard.top import terminal
+from acsard.top.feed import Feed
+from acsard.top.fleet_table import Roster, table
+from tests.unit.screens import BEFORE, INFO, STATE, drawn, sample_of
 
 
 class Session:
@@ -268,7 +170,7 @@ class Remembers:
     where = Address("tcp/127.0.0.1:7448", "acsar", "")
 
     def __init__(self, session: Session) -> None:
-        self.session, self.stored = session, STATE
+        self.session, self.stored = session, replace(STATE, reason="commanded by app")
 
     def sibling(self, name: str) -> Remembers:
         return self
@@ -283,7 +185,7 @@ def line_after(fleet: Roster, clock: Clock, seconds: float) -> str:
     for _ in range(int(seconds / 0.25)):
         fleet.rows()
         clock.now += 0.25
-    return table(fleet.rows(), 120)[1]
+    return drawn(table(fleet.rows(), 120), 120).splitlines()[1].rstrip()
 
 
 def test_a_robot_whose_state_only_a_storage_has_is_gone_and_was_never_seen(
@@ -303,7 +205,157 @@ def test_a_daemon_that_hangs_is_silent_though_a_storage_answers_for_it(
     session.announce("robot1")
     assert line_after(fleet, clock, 0.5).endswith("waiting for its state")
     assert line_after(fleet, clock, 5.0).endswith("SILENT, was: commanded by app")
-    robot.stored = replace(STATE, stamp=Time(1001))
+    robot.stored = replace(robot.stored, stamp=Time(1001))
     assert line_after(fleet, clock, 2.5).endswith("commanded by app")
     assert "SILENT" not in line_after(fleet, clock, 0.0)
     assert line_after(fleet, clock, 9.0).endswith("SILENT, was: commanded by app")
+
+
+@pytest.mark.parametrize("height", [1, 24])
+def test_a_terminal_of_any_height_shows_the_heading_and_the_last_line(
+    height: int, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def watch(draw: Any, suspend: list[bool]) -> bool:
+        Console(width=80).print(draw(80, height))
+        return False
+
+    monkeypatch.setattr(terminal, "_watch", watch)
+    monkeypatch.setattr(terminal, "_run_suspendable", lambda shows: shows([]))
+    rows = [Row("robot1", True, STATE, 0.1)]
+    fleet = SimpleNamespace(rows=lambda: rows, left_out_text="", presence_text="1 robot")
+    terminal.roster(cast(Roster, fleet))
+    head, line, *_, last = capsys.readouterr().out.splitlines()
+    assert (head.split()[0], line.split()[0]) == ("ROBOT", "robot1")
+    assert last.rstrip() == "q quits   1 robot"
+
+
+# one robot
+
+KEY = "acsard/acsar/state"
+
+
+class Robot:
+    """A client without a bus that gives states at times set by the test."""
+
+    where = Address("tcp/127.0.0.1:7448", "acsar", "")
+
+    def __init__(self) -> None:
+        self.now = 100.0
+        self.state: RobotState | DecodeError = STATE
+        self.queue: deque[Any] = deque()
+
+    def start_query(self, name: str, take: Any) -> None:
+        """Do nothing: the query of the follower gets no answer."""
+
+    def key(self, name: str) -> str:
+        return f"acsard/acsar/{name}"
+
+    def get(self, name: str) -> RobotState | Info:
+        if name == "info":
+            return INFO
+        if isinstance(self.state, DecodeError):
+            raise self.state
+        return self.state
+
+    def subscribe(self, name: str) -> Subscription:
+        assert name == "state"
+        return Subscription(self, KEY)
+
+    def try_recv(self) -> Any:
+        return self.queue.popleft() if self.queue else None
+
+    def tells(self, state: RobotState, key: str = KEY) -> None:
+        self.queue.append(sample_of(state, key))
+
+
+@pytest.fixture
+def robot(monkeypatch: pytest.MonkeyPatch) -> Robot:
+    robot = Robot()
+    monkeypatch.setattr(top_feed, "clock", SimpleNamespace(steady_s=lambda: robot.now))
+    return robot
+
+
+def feed_of(robot: Robot) -> Feed:
+    return Feed(cast(Connection, robot))
+
+
+def at(sec: int, lines: int = 1300) -> RobotState:
+    counters = STATE.counters | {"lines": lines}
+    return replace(STATE, stamp=Time(sec), counters=counters)
+
+
+def test_a_query_gets_the_present_state_before_one_is_published(robot: Robot) -> None:
+    feed = feed_of(robot)
+    assert feed.screen_data().state is None
+    feed.query_state()
+    assert feed.screen_data().state == STATE
+
+
+def test_two_queries_give_two_states_to_compute_rates(robot: Robot) -> None:
+    feed = feed_of(robot)
+    robot.state = BEFORE
+    feed.query_state()
+    robot.state = STATE
+    feed.query_state()
+    assert (feed.screen_data().before, feed.screen_data().state) == (BEFORE, STATE)
+
+
+def test_the_time_between_two_states_is_measured_by_the_viewer_s_clock(robot: Robot) -> None:
+    feed = feed_of(robot)
+    assert feed.screen_data().passed == 0.0
+    feed.query_state()
+    robot.now += 0.8
+    robot.state = at(9000)
+    feed.query_state()
+    assert feed.screen_data().passed == pytest.approx(0.8)
+
+
+@pytest.mark.parametrize("sec", [999, 1001])
+def test_the_later_of_an_answer_and_a_published_state_is_shown(robot: Robot, sec: int) -> None:
+    feed = feed_of(robot)
+    robot.state = at(1000)
+    robot.tells(at(sec, lines=1300 + sec - 1000))
+    feed.query_state()
+    feed.poll()
+    state = feed.screen_data().state
+    assert state is not None
+    assert state.stamp == Time(max(1000, sec))
+
+
+def test_a_put_on_a_wildcard_is_not_a_state(robot: Robot) -> None:
+    feed = feed_of(robot)
+    robot.tells(STATE, "acsard/**")
+    feed.poll()
+    assert feed.screen_data().state is None
+
+
+def test_a_state_of_another_version_is_reported_as_such(robot: Robot) -> None:
+    feed = feed_of(robot)
+    robot.state = DecodeError("wrong_shape", "unknown field")
+    with pytest.raises(ReplyError, match="a different version"):
+        feed.query_state()
+    assert feed.screen_data().undecodable == 1
+
+
+def test_a_silence_is_reported_sooner_once_a_state_has_arrived(robot: Robot) -> None:
+    feed = feed_of(robot)
+    robot.now += FIRST_STATE_TIMEOUT_S - 0.01
+    assert not feed.screen_data().silent
+    robot.now += 0.02
+    assert feed.screen_data().silent
+    robot.tells(STATE)
+    feed.poll()
+    robot.now += ROBOT_SILENCE_TIMEOUT_S - 0.01
+    assert not feed.screen_data().silent
+    robot.now += 0.02
+    assert feed.screen_data().silent
+
+
+def test_the_rates_begin_again_when_another_daemon_answers(robot: Robot) -> None:
+    feed = feed_of(robot)
+    robot.tells(STATE)
+    feed.poll()
+    robot.now += 0.1
+    robot.tells(BEFORE)  # its counters are smaller
+    feed.poll()
+    assert (feed.screen_data().before, feed.screen_data().state) == (BEFORE, BEFORE)
