@@ -92,19 +92,13 @@ class Authority:
     def permits(self, address: str) -> bool:
         """Return whether the authority may sign for a host name or IP address.
 
-        Without permitted names in its certificate, all are permitted that it does not exclude; so
-        are networks.
+        An authority of another program may have no limits. All are permitted then.
         """
         try:
-            constraints = self._certificate.extensions.get_extension_for_class(x509.NameConstraints)
+            limits = self._certificate.extensions.get_extension_for_class(x509.NameConstraints)
         except x509.ExtensionNotFound:
             return True
-        kind, limits = type(_general_name(address)), constraints.value
-        permitted = [name for name in limits.permitted_subtrees or () if isinstance(name, kind)]
-        excluded = [name for name in limits.excluded_subtrees or () if isinstance(name, kind)]
-        if any(_within(address, name) for name in excluded):
-            return False
-        return not permitted or any(_within(address, name) for name in permitted)
+        return any(_within(address, name) for name in limits.value.permitted_subtrees or ())
 
     def names_in(self, directory: Path) -> list[str]:
         """Return the host names and IP addresses in the certificate in `directory`."""
@@ -209,13 +203,12 @@ def _general_name(address: str) -> x509.GeneralName:
         return x509.DNSName(address)
 
 
-def _within(address: str, subtree: x509.GeneralName) -> bool:
-    # By the rules of OpenSSL: a network matches IP addresses, a name host names.
-    if isinstance(subtree, x509.IPAddress):
-        return ipaddress.ip_address(address) in ipaddress.ip_network(str(subtree.value))
-    name, base = address.lower(), str(subtree.value).lower()
-    # An empty constraint matches every name. A leading dot matches only the names below the rest.
-    return not base or name == base or name.endswith(f".{base.removeprefix('.')}")
+def _within(address: str, permitted: x509.GeneralName) -> bool:
+    name = _general_name(address)
+    if isinstance(permitted, x509.IPAddress):
+        is_address = isinstance(name, x509.IPAddress)
+        return is_address and name.value in ipaddress.ip_network(str(permitted.value))
+    return f".{address.lower()}".endswith(f".{permitted.value}")
 
 
 def _pem(certificate: x509.Certificate) -> bytes:

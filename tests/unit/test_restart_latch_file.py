@@ -497,3 +497,8 @@ def test_without_a_file_every_answer_is_sent_at_once_and_nothing_is_reported() -
     keeper.wait()
     assert (keeper.latches, keeper.is_stored, keeper.trouble) == (STOP, True, None)
     assert keeper.take_events() == []
+
+
+def test_a_real_disk_is_synced(tmp_path: Path) -> None:
+    with pytest.raises(FileNotFoundError):
+        Disk().sync(tmp_path / "none")

@@ -24,7 +24,7 @@ from acsard.host.errors import UsageError
 from acsard.machine.router_file import router_file
 from tests.each import each
 
-TEMPLATE = (Path(__file__).resolve().parents[3] / "deploy" / "zenoh" / "router.json5").read_text()
+TEMPLATE = (Path(__file__).resolve().parents[2] / "deploy" / "zenoh" / "router.json5").read_text()
 
 TEN = tuple(f"robot{n}" for n in range(1, 11))
 

@@ -6,9 +6,7 @@ OpenSSL checks this in the tests.
 from __future__ import annotations
 
 import errno
-import ipaddress
 import ssl
-from collections.abc import Sequence
 from contextlib import suppress
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
@@ -89,53 +87,6 @@ def test_an_authority_of_another_program_without_constraints_may_sign_for_any_na
     certificate = x509.load_pem_x509_certificate((tmp_path / "certificate.pem").read_bytes())
     key = ec.generate_private_key(ec.SECP256R1())
     assert Authority(certificate, key).permits("bank.example")
-
-
-def subtree(text: str) -> x509.GeneralName:
-    """Return a name constraint: an IP network, or a DNS name, which may be empty."""
-    try:
-        return x509.IPAddress(ipaddress.ip_network(text))
-    except ValueError:
-        return x509.DNSName(text)
-
-
-@each(
-    ("permitted", "excluded", "name", "valid"),
-    [
-        # A kind of name that the constraints do not list is not restricted.
-        (["robot.example"], [], "203.0.113.9", True),
-        (["robot.example"], [], "2001:db8::9", True),
-        (["robot.example"], [], "bank.example", False),
-        (["203.0.113.0/24"], [], "bank.example", True),
-        (["203.0.113.0/24"], [], "203.0.113.9", True),
-        (["203.0.113.0/24"], [], "8.8.8.8", False),
-        (["203.0.113.0/24"], [], "2001:db8::9", False),
-        # A constraint with a leading dot permits only the names below.
-        ([".robot.example"], [], "arm.robot.example", True),
-        ([".robot.example"], [], "robot.example", False),
-        ([".robot.example"], [], "notrobot.example", False),
-        (["Robot.example"], [], "arm.robot.example", True),
-        ([""], [], "bank.example", True),
-        ([], ["robot.example"], "arm.robot.example", False),
-        ([], ["robot.example"], "bank.example", True),
-        (["robot.example"], ["0.0.0.0/0"], "203.0.113.9", False),
-        (["203.0.113.0/24"], [""], "robot.example", False),
-    ],
-)
-def test_the_constraints_of_an_authority_of_another_program_are_read_as_openssl_reads_them(
-    permitted: Sequence[str], excluded: Sequence[str], name: str, valid: bool,
-    tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch,
-) -> None:  # fmt: skip
-    limits = x509.NameConstraints(
-        [*map(subtree, permitted)] or None, [*map(subtree, excluded)] or None
-    )
-    monkeypatch.setattr(making, "_constraints", lambda addresses: limits)
-    where = tmp_path_factory.mktemp("foreign")
-    ours = Authority.make(where, "foreign", 1)
-    ours.issue(where / "robot", "robot", [name], 1)
-    ours.issue(where / "client", "operator", [], 1)
-    assert connects(where, where / "robot", name, where / "client") == valid
-    assert ours.permits(name) == valid
 
 
 @each("name", ["anna", "anna.meyer", "laptop-anna.example.com"])
