@@ -25,7 +25,7 @@ from acsard.core.simulator.fake_mcu import FakeMcu
 from acsard.core.simulator.virtual_wire import VirtualWire
 from acsard.host.errors import Exit, MendableError, NoPortError, UsageError
 from acsard.terminal.prompt import TerminalPrompt, ended_by_signals
-from tests.unit.checkup.robots import Busy, Robot
+from tests.unit.checkup_robots import Busy, Robot
 
 
 def called(where: Path, *words: str, text: str = "") -> int:

@@ -1,17 +1,21 @@
-"""Tests of the board: lines it sends, lines it accepts as answers, and reasons to end a check."""
+"""A board that does not stop, runs away or falls silent ends the check."""
 
 from __future__ import annotations
 
 import pytest
 
-from acsard.checkup.board import Board, Operator, Wire
+from acsard.checkup.board import Board
 from acsard.checkup.findings import StoppedError
 from acsard.checkup.motion import MOTOR_TIMEOUT_S, SLOWING_TIMEOUT_S, SPEED, ZERO
+from acsard.checkup.watchdog import run
+from acsard.checkup.wheels import turn
 from acsard.core.config.settings import Config, McuConfig, SimConfig
-from acsard.core.simulator.fake_mcu import FakeMcu
+from acsard.core.simulator import protocol
 from acsard.core.simulator.virtual_wire import VirtualWire
 from acsard.host.errors import MendableError
-from tests.unit.checkup.robots import Nobody, Robot
+from tests.unit.checkup_robots import Robot
+
+ALL = (0, 1, 2, 3)
 
 
 def test_no_line_is_sent_if_the_serial_line_does_not_open() -> None:
@@ -23,37 +27,6 @@ def test_no_line_is_sent_if_the_serial_line_does_not_open() -> None:
     with pytest.raises(MendableError), Board(robot, McuConfig(), 100.0):
         pass
     assert robot.sent == []
-
-
-def test_a_line_commands_motors_whatever_wheels_are_configured() -> None:
-    robot = Robot()
-    with robot.board() as board:
-        assert board.line((1.0, -2.0, 0.0, 3.0)) == b"ap01.00,bn02.00,cp00.00,dp03.00\r\n"
-        assert board.line((1.0, -2.0, 0.0, 3.0), True).endswith(b"dp03.00,\r\n")
-        board.sealed = board.sampled = True
-        assert board.line(ZERO).startswith(b"ap00.00,bp00.00,cp00.00,dp00.00#01S*")
-
-
-def test_driving_returns_a_reply_to_every_line_with_the_measured_speeds() -> None:
-    robot = Robot()
-    with robot.board() as board:
-        before = len(robot.sent)
-        replies = board.drive((SPEED, 0.0, 0.0, 0.0), 0.5)
-        assert len(replies) >= len(robot.sent) - before - 2 >= 20
-        assert replies[-1].motors[0] == pytest.approx(SPEED, abs=0.2)
-        assert replies[-1].motors[1:] == (0.0, 0.0, 0.0)
-        assert board.turning() == [0]
-        board.stop_motors()
-        assert board.turning() == []
-
-
-def test_replies_have_the_time_at_which_they_were_complete() -> None:
-    robot = Robot()
-    with robot.board() as board:
-        replies = board.drive(ZERO, 0.3)
-        times = [reply.at_s for reply in replies]
-        assert times == sorted(times)
-        assert times[-1] <= board.now_s
 
 
 @pytest.mark.parametrize("sent", [False, True])
@@ -104,34 +77,6 @@ def test_a_message_names_the_motors_that_turn_after_the_second_attempt_to_stop()
     assert end.value.finding.name == "stop"
     assert "motor a (front right)" in end.value.finding.text
     assert "motor b" not in end.value.finding.text
-
-
-def test_a_board_that_falls_silent_while_its_motors_must_stop_is_reported_as_silent() -> None:
-    robot = Robot("plain_only")
-    with robot.board() as board:
-        board.drive((SPEED, 0.0, 0.0, 0.0), 0.3)
-        with robot.mcu.mute(), pytest.raises(StoppedError) as end:
-            board.stop_motors()
-        assert not board.runaway_seen
-        assert board.silent_s == pytest.approx(2 * MOTOR_TIMEOUT_S, abs=0.1)
-    assert end.value.finding.name == "link"
-    assert end.value.finding.figure == f"silent for {2 * MOTOR_TIMEOUT_S:.1f} s"
-    assert "while this computer sent it only zeros" in end.value.finding.text
-
-
-def test_a_board_that_ignores_lines_with_the_other_ending_is_not_reported_as_silent() -> None:
-    class Picky(Robot):
-        """A robot that does not stop, and whose replies end after 2 s."""
-
-        def listen(self, until_ns: int) -> list[tuple[int, bytes]]:
-            super().listen(until_ns)
-            line = b"ap03.00,bp00.00,cp00.00,dp00.00\r\n"
-            return [(until_ns, line)] if until_ns < MOTOR_TIMEOUT_S * 1e9 else []
-
-    with Board(Picky("mute"), McuConfig(), 100.0) as board, pytest.raises(StoppedError) as end:
-        board.stop_motors()
-    assert end.value.finding.name == "stop"
-    assert "motor a (front right)" in end.value.finding.text
 
 
 def test_one_damaged_reply_is_not_a_runaway_but_three_are() -> None:
@@ -202,21 +147,18 @@ def test_the_check_waits_for_wheels_that_slow_down_and_blames_no_comma(sent: boo
         assert MOTOR_TIMEOUT_S < board.now_s - began_s < SLOWING_TIMEOUT_S
 
 
-def test_the_wait_for_wheels_that_slow_down_has_an_end() -> None:
-    config = Config(sim=SimConfig(motor_time_constant=5.0))
-    robot = Robot("plain_only", config=config)
+def test_motors_that_turn_alone_but_not_together_end_the_check() -> None:
+    def gives_in(line: bytes) -> protocol.Command | None:
+        command = protocol.reference(line)
+        if command and sum(map(bool, command.values.values())) > 1:
+            return protocol.Command(dict.fromkeys(command.values, 0.0))
+        return command
+
+    robot = Robot("plain_only")
     with robot.board() as board:
-        board.drive((0.0, 0.0, 0.0, SPEED), 4.0)
-        began = robot.now_ns()
-        board.stop_motors()  # the second wait succeeds
-        assert SLOWING_TIMEOUT_S * 1e9 < robot.now_ns() - began < 2 * SLOWING_TIMEOUT_S * 1e9
-        assert not board.latched
-        assert not board.comma
-
-
-def test_the_virtual_wire_is_a_wire_and_the_absent_operator_is_an_operator() -> None:
-    wire: Wire = VirtualWire(FakeMcu(Config()))
-    operator: Operator = Nobody()
-    assert wire.now_ns() == 0
-    assert operator.ask("lifted?", ("lifted",)) == "lifted"
-    assert operator.ask("which?", ("this", "that")) is None
+        robot.mcu.understand = gives_in
+        assert turn(board, 0, 3.0)[0][0] == pytest.approx(3.0, abs=0.1)
+        board.stop_motors()
+        with pytest.raises(StoppedError) as end:
+            run(board, ALL, 0.0)
+    assert "not together" in end.value.finding.text

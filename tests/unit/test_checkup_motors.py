@@ -1,18 +1,102 @@
-"""Tests of the step that turns each motor, and of its findings about motors and encoders."""
+"""What the check concludes from the measured speeds of the motors."""
 
 from __future__ import annotations
+
+import math
 
 import pytest
 from msgspec import structs
 
-from acsard.checkup import dialect, motion, wheels
-from acsard.checkup.motion import SHORT_MEASUREMENT_S, SLOWING_TIMEOUT_S, SPEED
+from acsard.checkup import motion, wheels
+from acsard.checkup.motion import SHORT_MEASUREMENT_S, SLOWING_TIMEOUT_S, SPEED, BoardReply
 from acsard.checkup.wheels import Channel, Kind, encoder_finding, wheel_map
-from acsard.core.config.settings import Config, McuConfig, SimConfig, WheelMap
+from acsard.core.config.settings import Config, McuConfig, SimConfig
+from acsard.core.link.checked_line import Reading
 from acsard.core.link.codec import Motors
 from acsard.core.values import WHEELS
 from tests.each import each
-from tests.unit.checkup.robots import Robot
+from tests.unit.checkup_robots import Robot
+
+# Speeds.
+
+
+def course(
+    speed: float, per_turn: int, period_ms: int = 20, seconds: float = 1.0, sampled: bool = False
+) -> list[BoardReply]:
+    """Return replies in which the speed of motor b follows from its whole counts."""
+    series, before = [], 0
+    for n in range(1, int(seconds * 1000 / period_ms)):
+        counts = math.floor(speed * n * period_ms / 1000 / math.tau * per_turn)
+        velocity = (counts - before) / per_turn * math.tau / period_ms * 1000
+        reading = Reading(n * period_ms, (0, counts % 65536, 0, 0)) if sampled else None
+        series.append(BoardReply(n * period_ms / 1000, (0.0, velocity, 0.0, 0.0), b"", reading))
+        before = counts
+    return series
+
+
+@pytest.mark.variations(4)
+@pytest.mark.parametrize("sampled", [False, True])
+@pytest.mark.parametrize("per_turn", [16, 24, 48, 64, 96, 3200])
+@pytest.mark.parametrize("period_ms", [10, 20, 100])
+def test_a_coarse_encoder_is_not_a_runaway_but_a_real_runaway_is_found(
+    sampled: bool, per_turn: int, period_ms: int
+) -> None:
+    for speed in (3.0, -3.0):
+        good = course(speed, per_turn, period_ms, 3.0, sampled)
+        for n in range(1, len(good)):
+            assert motion.runaway(good[:n]) is None
+    runaway = motion.runaway(course(-9.0, per_turn, period_ms, 1.0, sampled))
+    assert runaway is not None
+    assert runaway[0] == 1
+    assert -10.0 < runaway[1] < -6.0
+
+
+@pytest.mark.parametrize("sampled", [False, True])
+def test_a_sudden_runaway_is_found_by_its_third_reply(sampled: bool) -> None:
+    replies = course(1.0, 3200, 20, 1.0, sampled)
+    for _ in range(3):
+        assert motion.runaway(replies) is None
+        last = replies[-1]
+        counts = (0, last.reading.counts[1] + 200, 0, 0) if last.reading else (0, 0, 0, 0)
+        reading = last.reading and Reading(last.reading.mcu_ms + 20, counts)
+        replies.append(BoardReply(last.at_s + 0.02, (0.0, 19.6, 0.0, 0.0), b"", reading))
+    assert motion.runaway(replies) is not None
+
+
+def test_without_replies_there_is_no_runaway_no_angle_and_no_trend() -> None:
+    assert motion.runaway([]) is None
+    assert motion.covered([], 0) == (0.0,) * 4
+    assert motion.trend([], 0, 0.02) == (1.0,) * 4
+
+
+@pytest.mark.parametrize("per_turn", [24, 3200])
+def test_the_covered_angle_is_the_sum_of_the_speeds_over_time(per_turn: int) -> None:
+    replies = course(3.0, per_turn)
+    assert motion.covered(replies, 0)[1] == pytest.approx(2.94, abs=math.tau / per_turn)
+    assert motion.covered(replies, 0.5)[1] == pytest.approx(1.44, abs=2 * math.tau / per_turn)
+
+
+def test_a_trend_is_the_ratio_to_the_earlier_speed() -> None:
+    speeds = [3.0 * 0.99**n for n in range(100)]
+    replies = [BoardReply(n * 0.02, (0.0, -s, 3.0, 0.0), b"") for n, s in enumerate(speeds)]
+    a, b, c, d = motion.trend(replies, replies[-1].at_s, 0.02)
+    assert (a, c, d) == (1.0, 1.0, 1.0)
+    assert b == pytest.approx(0.99**25, rel=0.01)
+
+
+@pytest.mark.parametrize("per_turn", [16, 48, 400, 3200])
+def test_a_motor_between_two_counts_turns_and_a_silent_one_stands(per_turn: int) -> None:
+    replies = course(0.6, per_turn, seconds=3.0)
+    first = next(n for n, reply in enumerate(replies) if reply.motors[1])
+    for n in range(first + 1, len(replies)):
+        assert motion.turning(replies[:n], replies[n - 1].at_s) == [1]
+    end_s = replies[-1].at_s
+    assert motion.turning(replies, end_s + motion.MAX_REPLY_AGE_S + 0.01) == []
+    assert motion.turning([], end_s) == []
+
+
+# Motors.
+
 
 MCU = McuConfig()
 
@@ -59,12 +143,6 @@ def test_a_swapped_encoder_that_counts_back_is_also_called_reversed() -> None:
     assert "reversed" not in encoder_finding(MCU, channel_of(0, 1)).text
 
 
-def test_findings_name_the_configured_wheel_of_a_motor() -> None:
-    mcu = McuConfig(wheels=WheelMap("-d", "+b", "+c", "+a"))
-    assert encoder_finding(mcu, channel_of(0, 0)).name == "motor a (rear right)"
-    assert encoder_finding(mcu, channel_of(3, 3)).name == "motor d (front right)"
-
-
 def test_a_map_needs_a_person_for_every_motor() -> None:
     channels = [
         Channel(m, channel_of(m, m).forth, channel_of(m, m).back, WHEELS[m]) for m in range(4)
@@ -83,26 +161,10 @@ def test_a_wheel_that_was_seen_for_two_motors_fails_the_wheel_map() -> None:
     assert "rear left" in finding.text
 
 
-def test_a_motor_a_fifth_weak_is_reported_with_its_share() -> None:
-    finding = encoder_finding(MCU, channel_of(2, 2, 2.4, -2.45))
-    assert "20% slower than the commanded 3 rad/s" in finding.text
-    assert "faster" in encoder_finding(MCU, channel_of(2, 2, 3.3, -3.3)).text
-    assert "turn freely" in finding.mend
-
-
 def test_the_uncertainty_of_a_coarse_encoder_is_not_blamed_on_the_motor() -> None:
     channel = channel_of(0, 0, 3.0, -2.75)
     assert channel.kind == "off"
     assert structs.replace(channel, unsure=0.05).kind == "right"
-
-
-@pytest.mark.parametrize("motor", range(4))
-def test_only_the_commanded_motor_turns(motor: int) -> None:
-    robot = Robot("plain_only")
-    with robot.board() as board:
-        means, _ = wheels.turn(board, motor, -SPEED)
-        assert means[motor] == pytest.approx(-SPEED, abs=0.1)
-        assert [m for m in range(4) if means[m]] == [motor]
 
 
 def test_the_speed_is_ramped() -> None:
@@ -114,22 +176,6 @@ def test_the_speed_is_ramped() -> None:
     assert speeds[:9] == sorted(speeds[:9])
     assert speeds[0] <= SPEED / 5
     assert max(speeds) == SPEED
-
-
-def test_a_motor_without_measured_speed_is_driven_only_briefly() -> None:
-    robot = Robot("plain_only", "stuck_encoder=1".replace("1", "b"))
-    with robot.board() as board:
-        began = robot.now_ns()
-        wheels.run_up(board, motion.only([1]))
-        assert robot.now_ns() - began < 1e9
-
-
-def test_every_motor_that_turns_as_commanded_is_right() -> None:
-    with Robot("plain_only").board() as board:
-        channels = [wheels.channel(board, motor) for motor in range(4)]
-        comma = dialect.comma(board, channels[-1].kind == "dead")
-    assert [channel.kind for channel in channels] == ["right"] * 4
-    assert (comma.verdict, comma.figure) == ("PASS", "not needed")
 
 
 def test_a_probe_is_short_and_commands_a_dead_motor_at_most_3_rad_s() -> None:

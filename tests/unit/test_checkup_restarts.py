@@ -1,4 +1,4 @@
-"""The check reports a restart of the board separately and repeats the interrupted step."""
+"""A restart of the board is a finding of its own, and the interrupted step is repeated."""
 
 from __future__ import annotations
 
@@ -21,9 +21,11 @@ from acsard.core.config.settings import Config
 from acsard.core.link.checked_line import Reading
 from acsard.core.link.session import IDENTITY
 from tests.each import each
-from tests.unit.checkup.robots import MS, Checked, Robot, check
+from tests.unit.checkup_robots import MS, Checked, Robot
 
 NAME = IDENTITY + b"1 counts=3200"
+
+
 TEXT = b"Booting v2"
 
 
@@ -41,35 +43,7 @@ class Restarting(Robot):
         return super().listen(until_ns)
 
 
-MOMENTS = [
-    (1.0, "no motor turned"),
-    pytest.param(3.5, "no motor turned", marks=pytest.mark.slow),
-    (6.0, "no motor turned"),
-    (9.0, "motor "),
-    pytest.param(11.0, "motor ", marks=pytest.mark.slow),
-    pytest.param(15.0, "motor ", marks=pytest.mark.slow),
-    pytest.param(21.0, "", marks=pytest.mark.slow),
-]
 DIALECTS = pytest.mark.parametrize("faults", [(), ("no_sample",), ("plain_only",)], ids=str)
-
-
-@pytest.mark.slow
-@DIALECTS
-@pytest.mark.parametrize(("at_s", "when"), MOMENTS)
-def test_a_restart_of_the_board_fails_and_changes_no_other_finding(
-    faults: tuple[str, ...], at_s: float, when: str
-) -> None:
-    checked, sound = Checked(Restarting([at_s], *faults)), check(*faults)
-    assert checked.failed == ["restarts"]
-    assert [
-        (result.name, result.verdict) for result in checked.findings if result.name != "restarts"
-    ] == ([(result.name, result.verdict) for result in sound.findings])
-    assert checked.changes == sound.changes
-    assert checked["restarts"].figure == "restarted"
-    assert f"while {when}" in checked["restarts"].text
-    assert "supply" in checked["restarts"].mend
-    assert "DTR" in checked["restarts"].mend
-    assert not checked.left_turning
 
 
 @DIALECTS
@@ -201,10 +175,6 @@ def detector_after(*replies: BoardReply) -> Restarts:
 
 def sign(restart: Restart | None) -> str:
     return "" if restart is None else restart.sign
-
-
-def test_the_name_sent_when_the_port_was_opened_is_not_a_restart() -> None:
-    assert Restarts().check_line(NAME, 2.0, None) is None
 
 
 def test_the_name_of_the_board_is_a_restart_unless_it_was_requested() -> None:

@@ -1,16 +1,23 @@
-"""Tests of the printed findings, and of the lines of acsard.toml that they suggest."""
+"""The texts of the check, its summary, and the lines of acsard.toml that it suggests."""
 
 from __future__ import annotations
+
+import re
+from typing import Any
 
 import pytest
 
 from acsard.checkup import checkup_report, lateness
 from acsard.checkup.checkup_report import report, summary
-from acsard.checkup.findings import SKIPPED_STEPS, Finding
+from acsard.checkup.findings import SKIPPED_STEPS, Finding, motor_name, wheel_of
+from acsard.checkup.motion import MAX_WATCHDOG_S
+from acsard.checkup.outcomes import OUTCOMES, OUTCOMES_BY_NAME, find
 from acsard.core.config.contradictions import contradictions
 from acsard.core.config.parsing import parse
-from acsard.core.config.settings import Config
-from tests.unit.checkup.robots import configured
+from acsard.core.config.settings import Config, McuConfig, WheelMap
+from acsard.core.link.link_state import WATCHDOG_S
+from tests.each import each
+from tests.unit.checkup_robots import configured
 
 RATE = Finding("baud rate", "PASS", keys={"mcu.baud_rate": 57600})
 
@@ -104,3 +111,62 @@ def test_the_port_at_which_a_board_answered_is_proposed() -> None:
     }
     answered = [Finding("baud rate", "PASS", keys={"mcu.baud_rate": 115200})]
     assert checkup_report.changes(answered, Config(), "/dev/one") == {"mcu.port": "/dev/one"}
+
+
+class AnyObservation(float):
+    """A stand-in for any observation: a number or words."""
+
+    def __format__(self, how: str) -> str:
+        return "seen"
+
+    def __repr__(self) -> str:
+        return "seen"
+
+
+SEEN = {part.partition("}")[0].partition(":")[0].partition("!")[0]
+        for part in OUTCOMES.split("{")[1:]}  # fmt: skip
+
+
+@each("outcome", OUTCOMES_BY_NAME)
+def test_every_outcome_has_complete_texts(outcome: str) -> None:
+    finding = find(outcome, {"mcu.baud_rate": 9600}, **dict.fromkeys(SEEN, AnyObservation()))
+    assert finding.name == outcome.partition(":")[0]
+    assert finding.keys == {"mcu.baud_rate": 9600}
+    assert not {"{", "}", "  ", "->"} & {*finding.figure, *finding.text.split(" "), *finding.mend}
+    if finding.verdict in ("FAIL", "WARN"):
+        assert finding.text
+        # These two outcomes have no repair text, because a look at the board would not help.
+        assert finding.mend or outcome in ("encoder counts: many", "wheels: not lifted")
+
+
+def test_the_advised_watchdog_time_is_that_of_the_contract() -> None:
+    entries = [entry for name, entry in OUTCOMES_BY_NAME.items() if name.startswith("watchdog:")]
+    text = " ".join(part for entry in entries for part in (entry.text, entry.mend))
+    times = {f"{1000 * seconds:g}" for seconds in (WATCHDOG_S, MAX_WATCHDOG_S)}
+    assert set(re.findall(r"(\d+) ms", text)) == times
+
+
+def test_a_runaway_against_the_command_is_blamed_on_the_leads() -> None:
+    fields: dict[str, Any] = {
+        "letter": "b",
+        "told": 3.0,
+        "seen": -9.0,
+        "most": 6.0,
+        "motor": "motor b (front left)",
+    }
+    assert "leads" in find("runaway: against", **fields).mend
+    assert "leads" not in find("runaway: along", **fields).mend
+
+
+TURNED = McuConfig(wheels=WheelMap("-c", "+d", "-a", "+b"))
+
+
+@pytest.mark.parametrize(
+    ("motor", "wheel"),
+    list(enumerate([("rear_left", -1), ("rear_right", 1), ("front_right", -1), ("front_left", 1)])),
+)
+def test_the_wheel_and_sign_of_a_motor_are_the_configured_ones(
+    motor: int, wheel: tuple[str, int]
+) -> None:
+    assert wheel_of(TURNED, motor) == wheel
+    assert motor_name(TURNED, motor) == f"motor {'abcd'[motor]} ({wheel[0].replace('_', ' ')})"

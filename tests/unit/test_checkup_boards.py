@@ -1,0 +1,288 @@
+"""The check of boards with and without faults: each fault is named with its remedy, nothing else.
+
+The approved texts have what the check says about each board, without what it says about the first
+board of the page too: equal findings and, except on the page of good boards, passed steps.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterator, Sequence
+from itertools import combinations
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from acsard.checkup import inputs
+from acsard.checkup.findings import Finding
+from acsard.checkup.procedure import STEPS
+from acsard.core.config.settings import Config, McuConfig, Place, SafetyConfig, SimConfig, WheelMap
+from acsard.core.simulator import protocol
+from acsard.core.values import NS_PER_S, WHEELS
+from tests.each import each
+from tests.unit.checkup_robots import Checked, Nobody, Person, Robot, check
+
+WORDS = Path(__file__).with_name("words")
+
+MOTORS = "abcd"
+SPEED = re.compile(rb"[abcd][pn](\d\d\.\d\d)")
+COARSE = Config(sim=SimConfig(encoder_counts=16))
+HEAVY = Config(sim=SimConfig(motor_time_constant=1.0))
+WIRED = Config(mcu=McuConfig(wheels=WheelMap("-c", "+d", "-a", "+b")))
+
+
+def at_baud(rate: Any) -> Config:
+    return Config(mcu=McuConfig(baud_rate=rate))
+
+
+# Maps the pages to boards: the faults, the settings of the host, and whether a person watches.
+# Without a person the check names both parts that may be at fault.
+BOARDS: dict[str, dict[str, tuple[str, dict[str, Any], bool]]] = {
+    "good": {
+        "plain": ("plain_only", {}, False),
+        "checked, in use": ("no_sample", {"link_check": "on"}, False),
+        "counts, in use": ("", {"link_check": "on", "encoder_counts": 3200}, False),
+        "counts, not in use": ("", {}, False),
+        "an old sketch": ("free_running plain_only", {"reply_period": 0.1}, False),
+        "a comma": ("", {"trailing_comma": True}, False),
+        "status lines": ("plain_only estop", {}, False),
+        "with a person": ("plain_only", {}, True),
+        "9600 baud": ("", {"config": at_baud(9600)}, False),
+        "heavy wheels": ("plain_only", {"config": HEAVY}, False),
+        "coarse encoders": ("plain_only", {"config": COARSE}, True),
+    },
+    "lines": {
+        "plain": ("plain_only", {}, False),
+        "silent": ("mute", {}, False),
+        "noise": ("noise", {}, False),
+        "pieces": ("partial_line", {}, False),
+        "another rate": ("plain_only", {"config": at_baud(57600), "baud_rate": 115200}, False),
+        "seldom": ("plain_only sparse_replies", {}, False),
+        "10 Hz by itself": ("plain_only free_running", {}, False),
+        "spaces": ("plain_only spaces", {}, False),
+        "unpadded": ("plain_only unpadded", {}, False),
+        "slow": ("plain_only slow_reply", {}, False),
+        "lost replies": ("lost_replies", {}, False),
+        "lost commands": ("lost_commands plain_only", {}, False),
+        "bit errors": ("bit_errors", {}, False),
+        "a silence": ("plain_only stalls=1:0.2", {}, False),
+        "no check, wanted": ("plain_only", {"link_check": "on"}, False),
+        "an old check, wanted": ("no_check", {"link_check": "on"}, False),
+    },
+    "motors": {
+        "plain": ("plain_only", {}, False),
+        **{f"{part} {letter}, seen": (f"plain_only {part}={letter}", {}, True)
+           for part, letter in [("reversed_motor", "c"), ("reversed_encoder", "b"),
+                                ("dead_motor", "d"), ("stuck_encoder", "a"),
+                                ("reversed_wheel", "a")]},
+        **{f"{part}, not seen": (f"plain_only {part}", {}, False)
+           for part in ["reversed_motor=c", "stuck_encoder=b", "dead_motor=d",
+                        "swapped_motors=a:b", "bias=c:0.93", "bias=c:0.7", "bias=b:3"]},
+        "swapped motors, seen": ("plain_only swapped_motors=a:b", {}, True),
+        "swapped encoders, seen": ("plain_only swapped_encoders=c:d", {}, True),
+        "any wiring": ("plain_only", {"config": WIRED, "wheels": WheelMap()}, True),
+    },
+    "firmware": {
+        "plain": ("plain_only", {}, False),
+        "no watchdog": ("plain_only no_watchdog", {}, False),
+        "a late watchdog": ("plain_only late_watchdog", {}, False),
+        "a watchdog that damaged lines feed": ("plain_only watchdog_fed_by_bad_lines", {}, False),
+        "a comma is needed": ("comma_latched", {}, False),
+        "a comma is needed, and configured": ("comma_latched", {"trailing_comma": True}, False),
+        "an old check": ("no_check", {}, False),
+        "wrong counts configured": ("", {"link_check": "on", "encoder_counts": 1600}, False),
+        "coarse encoders": ("", {"config": COARSE}, False),
+        "all at once": ("comma_latched wrong_baud=57600 reversed_motor=a stuck_encoder=b spaces "
+                        "no_watchdog reversed_wheel=c", {}, True),
+    },
+}  # fmt: skip
+
+
+def lines(finding: Finding) -> Iterator[str]:
+    yield f"{finding.verdict:8}{finding.name} | {finding.figure}"
+    if finding.verdict != "PASS":
+        yield f"        {finding.text}"
+    if finding.mend:
+        yield f"        -> {finding.mend}"
+
+
+@pytest.mark.parametrize("page", BOARDS)
+def test_the_check_names_each_fault_and_nothing_else(
+    page: str, approved: Callable[[Path, str], None]
+) -> None:
+    text, first, passed = "", list[Finding](), set[str]()
+    for name, (faults, how, person) in BOARDS[page].items():
+        robot = Robot(*faults.split(), **how)
+        checked = Checked(robot, person)
+        assert not checked.left_turning
+        sent = [line for line in robot.sent if b"x" not in line]
+        assert max(float(speed) for line in sent for speed in SPEED.findall(line)) <= 3.0
+        text += f"== {name}\n"
+        for finding in checked.findings:
+            if not (finding in first or (finding.verdict == "PASS" and finding.name in passed)):
+                text += "".join(f"{line}\n" for line in lines(finding))
+        text += "".join(f"        {key} = {value!r}\n" for key, value in checked.changes.items())
+        first = first or checked.findings
+        if page != "good":
+            passed = {finding.name for finding in first if finding.verdict == "PASS"}
+    approved(WORDS / f"checkup_{page}.txt", text)
+
+
+@each("letter", MOTORS)
+@each("part", ["motor", "encoder"])
+def test_a_person_who_sees_the_wheel_decides_which_reversed_part_is_named(
+    letter: str, part: str
+) -> None:
+    checked = check("plain_only", f"reversed_{part}={letter}", person=True)
+    (name,) = checked.failed
+    mend = checked[name].mend
+    assert ("two leads of motor" if part == "motor" else f"A and B of encoder {letter}") in mend
+
+
+@pytest.mark.variations(3)
+@pytest.mark.parametrize(("first", "other"), list(combinations(range(4), 2)))
+def test_two_swapped_wheels_give_a_changed_wheel_map(first: int, other: int) -> None:
+    checked = check("plain_only", f"swapped_wheels={MOTORS[first]}:{MOTORS[other]}", person=True)
+    assert checked.failed == ["wheel map"]
+    assert checked.changes[f"mcu.wheels.{WHEELS[first]}"] == f"+{MOTORS[other]}"
+    assert checked.changes[f"mcu.wheels.{WHEELS[other]}"] == f"+{MOTORS[first]}"
+
+
+@pytest.mark.variations(4)
+@pytest.mark.parametrize("fault", ["dead_motor=d", "stuck_encoder=d", "comma_latched"])
+@pytest.mark.parametrize("counts", [16, 48, 400])
+def test_coarse_encoders_change_no_verdict_on_the_last_motor(counts: int, fault: str) -> None:
+    checked = check(fault, config=Config(sim=SimConfig(encoder_counts=counts)))
+    if fault == "comma_latched":
+        assert checked.changes["mcu.trailing_comma"] is True
+    else:
+        assert checked.failed == ["motor d (rear right)"]
+        assert checked["trailing comma"].verdict == "SKIPPED"
+
+
+def test_every_step_has_a_finding() -> None:
+    checked = check(person=True)
+    names = {"motors" if f.name.startswith("motor ") else f.name for f in checked.findings}
+    assert names == set(STEPS)
+
+
+def test_an_encoder_that_moves_while_no_wheel_turns_fails_its_motor() -> None:
+    robot = Robot("plain_only")
+
+    class Watching(Person):
+        def ask(self, question: str, answers: Sequence[str]) -> str | None:
+            answer = super().ask(question, answers)
+            return "none" if "did motor b turn" in question else answer
+
+    checked = Checked(robot, Watching(robot))
+    assert checked.failed == ["motor b (front left)"]
+    assert "you saw no wheel turn" in checked["motor b"].text
+
+
+def test_an_echo_is_not_taken_for_a_robot() -> None:
+    class Echo(Robot):
+        echo = b""
+
+        def send(self, data: bytes) -> None:
+            self.sent.append(data)
+            self.echo += data
+
+        def listen(self, until_ns: int) -> list[tuple[int, bytes]]:
+            data, self.echo = self.echo, b""
+            super().listen(until_ns)
+            return [(self.now_ns(), data)] if data else []
+
+    checked = Checked(Echo())
+    assert checked.failed == ["identification"]
+    assert checked["identification"].figure == "an echo"
+
+
+@each("comma", [False, True])
+def test_if_one_form_of_line_is_not_answered_the_other_form_is_used(comma: bool) -> None:
+    class Particular(Robot):
+        """A robot that accepts lines only with a final comma, or only without one."""
+
+        def send(self, data: bytes) -> None:
+            taken = [s for s in data.splitlines(keepends=True) if s.endswith(b",\r\n") == comma]
+            super().send(b"".join(taken))
+
+    checked = Checked(Particular("plain_only", trailing_comma=not comma))
+    assert checked.failed == ["trailing comma"]
+    assert checked.changes == {"mcu.trailing_comma": comma}
+    assert checked["reply rate"].verdict == checked["round trip"].verdict == "PASS"
+
+
+def test_firmware_that_refuses_plain_lines_is_checked_to_the_end() -> None:
+    class Refuses(Robot):
+        def send(self, data: bytes) -> None:
+            taken = [s for s in data.splitlines(keepends=True) if b"p" not in s or b"#" in s]
+            super().send(b"".join(taken))
+
+    assert Checked(Refuses()).failed == []
+
+
+def test_a_last_motor_that_obeys_zeros_only_with_a_comma_needs_the_trailing_comma() -> None:
+    def obeys(line: bytes) -> protocol.Command | None:
+        command = None if b"#" in line else protocol.reference(line)
+        if command and not command.values[3] and not line.endswith(b",\r\n"):
+            command.values.pop(3)
+        return command
+
+    robot = Robot()
+    robot.mcu.understand = obeys
+    checked = Checked(robot)
+    assert "still turns after zeros" in checked["trailing comma"].text
+    assert checked.changes["mcu.trailing_comma"] is True
+
+
+def test_the_check_waits_for_a_board_that_boots_when_the_port_opens() -> None:
+    robot = Robot()
+    robot.mcu.reset(0, 2 * NS_PER_S)
+    assert Checked(robot).failed == []
+
+
+# The inputs of a board, which a person presses.
+
+ALL = {"emergency stop": 0, "front bumper": 1, "rear bumper": 2}
+FRONTS: tuple[Place, ...] = ("front", "front", "front")
+TWO = SafetyConfig(bumpers=("front", "rear"))
+BOTH = SafetyConfig(estop="required", bumpers=("front", "rear"))
+SAME = SafetyConfig(bumpers=("front", "front"))
+OFF = SafetyConfig(estop="off", bumpers=("front", "rear"), bumper="off")
+
+
+PRESSED: dict[str, tuple[str, SafetyConfig, int, dict[str, int] | None]] = {
+    "no inputs": ("", SafetyConfig(), 2, {}),
+    "all": ("estop bumpers", BOTH, 2, ALL),
+    "a stop that is not configured": ("estop", SafetyConfig(), 2, ALL),
+    "not configured": ("bumpers", SafetyConfig(), 2, {"bumper 1": 1, "bumper 2": 2}),
+    "two at one place": ("bumpers", SAME, 2, {"front bumper (1)": 1, "front bumper (2)": 2}),
+    "switched off": ("estop bumpers", OFF, 2, ALL),
+    "nobody presses": ("estop bumpers", BOTH, 2, None),
+    "no bumpers reported": ("estop", BOTH, 2, ALL),
+    "no stop reported": ("bumpers", BOTH, 2, ALL),
+    "three bumpers reported": ("estop bumpers", BOTH, 3, ALL),
+    "swapped": ("bumpers", TWO, 2, {"front bumper": 2, "rear bumper": 1}),
+    "swapped, not configured": ("bumpers", SafetyConfig(), 2, {"bumper 1": 2, "bumper 2": 2}),
+    "one is dead": ("bumpers", TWO, 2, {"front bumper": 1}),
+    "one stays pressed": ("bumper_pressed=2:0:0", TWO, 2, {"front bumper": 1, "rear bumper": 2}),
+}  # fmt: skip
+
+
+def test_each_input_is_pressed_and_named_if_it_is_wrong(
+    approved: Callable[[Path, str], None],
+) -> None:
+    text = ""
+    for name, (faults, safety, reports, presses) in PRESSED.items():
+        built = SafetyConfig(bumpers=FRONTS[:reports])
+        robot = Robot(*faults.split(), config=Config(safety=built))
+        operator: Any = Nobody()
+        if presses is not None:
+            operator = Person(robot)
+            operator.presses = presses
+        with robot.board() as board:
+            board.listen(0.5)
+            finding = inputs.finding(board, operator, safety)
+        text += "\n".join([f"== {name}", *lines(finding), ""])
+    approved(WORDS / "checkup_inputs.txt", text)

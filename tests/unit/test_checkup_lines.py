@@ -1,0 +1,348 @@
+"""What the check concludes from counts, the watchdog's time, and lost and damaged lines."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import get_args
+
+import pytest
+
+from acsard.checkup import damage, dialect, encoder_counts, line_loss, watchdog
+from acsard.checkup.board import Board
+from acsard.checkup.findings import StoppedError
+from acsard.checkup.motion import SPEED, BoardReply
+from acsard.checkup.outcomes import find
+from acsard.checkup.wheels import turn
+from acsard.core.config.settings import Config, SimConfig, WheelMap
+from acsard.core.link.checked_line import Reading
+from acsard.core.link.codec import Codec, FrameError
+from acsard.core.link.link_diagnosis import ReceivedCode
+from acsard.core.simulator import protocol
+from tests.each import each
+from tests.unit.checkup_robots import Robot
+
+# Counts.
+
+
+def replies(per_turn: float, speed: float = 3.0, start: int = 65000) -> list[BoardReply]:
+    series = []
+    for n in range(100):
+        turned = round(n * 0.02 * speed / math.tau * per_turn)
+        reading = Reading((65500 + 20 * n) % 65536, ((start + turned) % 65536, 0, 0, 0))
+        series.append(BoardReply(n * 0.02, (speed, 0.0, 0.0, 0.0), b"", reading))
+    return series
+
+
+@each("per_turn", [64, 3200, 40000])
+@each("speed", [3.0, -3.0])
+def test_counts_per_turn_are_measured_over_wraps_of_clock_and_counts(
+    per_turn: int, speed: float
+) -> None:
+    measured = encoder_counts.per_turn(replies(per_turn, speed), [0])
+    assert measured == pytest.approx(per_turn, rel=0.02)
+
+
+def test_too_short_a_turn_gives_no_counts_per_turn() -> None:
+    assert encoder_counts.per_turn(replies(3200)[:20], [0]) is None
+    assert encoder_counts.per_turn(replies(3200), [1]) is None
+    assert encoder_counts.per_turn(replies(3200), []) is None
+
+
+@pytest.mark.parametrize("counts", [16, 20, 40, 96])
+def test_coarse_encoders_without_configured_counts_are_a_warning(counts: int) -> None:
+    with Robot(config=Config(sim=SimConfig(encoder_counts=counts))).board() as board:
+        for motor in range(4):
+            turn(board, motor, 3.0)
+            board.stop_motors()
+        finding = encoder_counts.finding(board, [0, 1, 2, 3])
+    assert (finding.verdict, finding.keys) == ("WARN", {})
+    assert "write mcu.encoder_counts" in finding.mend
+    about = int(finding.figure.split()[1])
+    assert about == pytest.approx(counts, rel=0.2)
+
+
+@each(
+    ("share", "words"),
+    [(-1.0, "motor b (front left) run against"), (0.0, "do not change"), (2.0, "do not agree")],
+)
+def test_wrong_counts_of_one_motor_are_found(share: float, words: str) -> None:
+    with Robot().board() as board:
+        board.sampled = True
+        board.replies = []
+        for reply in replies(3200):
+            assert reply.reading is not None
+            count, speed = reply.reading.counts[0], reply.motors[0]
+            counts = (count, round(share * (count - 65000)) % 65536, 0, 0)
+            motors = (speed, speed, 0.0, 0.0)
+            reading = Reading(reply.reading.mcu_ms, counts)
+            board.replies.append(BoardReply(reply.at_s, motors, b"", reading))
+        finding = encoder_counts.finding(board, [0, 1])
+    assert (finding.verdict, finding.keys) == ("FAIL", {})
+    assert words in finding.text
+
+
+def test_more_counts_than_the_host_accepts_are_a_warning() -> None:
+    with Robot().board() as board:
+        board.sampled, board.identity = True, {"counts": "400000"}
+        assert encoder_counts.finding(board, []).verdict == "WARN"
+
+
+@pytest.mark.parametrize(
+    ("configured", "wrong"), [(1600, "100.0%"), (2700, "18.5%"), (3700, "13.5%"), (12800, "75.0%")]
+)
+def test_wrong_configured_counts_are_found_by_the_speeds_and_corrected(
+    configured: int, wrong: str
+) -> None:
+    with Robot("no_sample", link_check="on", encoder_counts=configured).board() as board:
+        board.sampled = True
+        board.replies = replies(3200)
+        finding = encoder_counts.finding(board, [0])
+    assert (finding.verdict, finding.keys) == ("FAIL", {"mcu.encoder_counts": 3200})
+    assert finding.figure == f"3200, not {configured}"
+    assert f"every distance would be wrong by {wrong}" in finding.text
+
+
+def test_counts_that_do_not_change_while_the_wheels_turn_are_to_be_switched_off() -> None:
+    with Robot(encoder_counts=3200).board() as board:
+        board.sampled = True
+        board.replies = [BoardReply(r.at_s, r.motors, b"", Reading(20 * n % 65536, (7, 7, 7, 7)))
+                         for n, r in enumerate(replies(3200))]  # fmt: skip
+        finding = encoder_counts.finding(board, [0])
+    assert (finding.verdict, finding.keys) == ("FAIL", {"mcu.encoder_counts": 0})
+
+
+@pytest.mark.parametrize(
+    ("configured", "verdict", "keys"),
+    [
+        (0, "SKIPPED", {}),
+        (1600, "SKIPPED", {}),
+        (3210, "PASS", {"mcu.encoder_counts": 3210}),
+    ],
+)
+def test_if_lines_are_lost_only_configured_or_identified_counts_are_proposed(
+    configured: int, verdict: str, keys: dict[str, object]
+) -> None:
+    with Robot("no_sample", link_check="on", encoder_counts=configured).board() as board:
+        board.sampled, board.lost = True, line_loss.MAX_LOSS / 4
+        board.replies = replies(3200)
+        finding = encoder_counts.finding(board, [0])
+        assert (finding.verdict, finding.keys) == (verdict, keys)
+        if verdict == "SKIPPED":
+            assert "0.5% of the lines are lost" in finding.text
+        # a count that the board states itself needs no measurement
+        board.identity = {"counts": "3200"}
+        assert encoder_counts.finding(board, [0]).keys == {"mcu.encoder_counts": 3200}
+        board.lost = 2 * line_loss.MAX_LOSS
+        assert encoder_counts.finding(board, [0]).keys == {}
+
+
+# The watchdog.
+
+
+ALL = (0, 1, 2, 3)
+
+
+class ByItsOwnClock(Robot):
+    """A robot whose firmware measures each speed over one of its own fixed control periods."""
+
+    def __init__(self, *faults: str, config: Config | None = None) -> None:
+        super().__init__(*faults, config=config)
+        self.mcu._speeds = lambda now_ns: list(self.mcu.vehicle.speeds)  # type: ignore[method-assign]
+
+
+@contextmanager
+def turned(robot: Robot) -> Iterator[Board]:
+    """Run the steps before the watchdog test, and yield the board with motors at rest."""
+    with robot.board() as board:
+        dialect.rate(board)
+        dialect.check(board)
+        for motor in ALL:
+            turn(board, motor, 3.0)
+            board.stop_motors()
+        yield board
+        assert board.turning() == []
+
+
+def measured(robot: Robot) -> tuple[str, str]:
+    with turned(robot) as board:
+        finding = watchdog.finding(board, ALL)
+    assert robot.later() == [0.0] * 4
+    return finding.verdict, finding.figure
+
+
+@pytest.mark.variations(3)
+@pytest.mark.parametrize("kind", [("plain_only",), ("no_sample",), (), ("free_running",)])
+@pytest.mark.parametrize("time_ms", [120, 450])
+@pytest.mark.parametrize("robot", [Robot, ByItsOwnClock])
+def test_a_watchdog_time_within_the_contract_is_measured_and_passes(
+    kind: tuple[str, ...], time_ms: int, robot: type[Robot]
+) -> None:
+    instance = robot(*kind)
+    instance.mcu.watchdog_ns = time_ms * 1_000_000
+    verdict, figure = measured(instance)
+    value, _, about = figure.partition(" ms")
+    assert int(value) == pytest.approx(time_ms, abs=60 if about else 20)
+    assert verdict == "PASS"
+
+
+@pytest.mark.variations(3)
+@pytest.mark.parametrize("kind", [("plain_only",), (), ("free_running",)])
+@pytest.mark.parametrize("lag", [0.0, 0.05, 0.3])
+def test_the_run_out_of_a_motor_is_not_taken_for_the_watchdog(
+    kind: tuple[str, ...], lag: float
+) -> None:
+    config = Config(sim=SimConfig(motor_time_constant=lag))
+    for robot in (Robot, ByItsOwnClock):
+        verdict, figure = measured(robot(*kind, config=config))
+        assert int(figure.split()[0]) == pytest.approx(300, abs=80)
+        assert verdict == "PASS"
+
+
+def test_a_watchdog_too_short_for_any_host_is_a_warning() -> None:
+    robot = Robot()
+    robot.mcu.watchdog_ns = 40_000_000
+    assert measured(robot)[0] == "WARN"
+
+
+def test_firmware_that_obeys_broken_lines_never_gets_more_than_the_commanded_speed() -> None:
+    robot = Robot("comma_latched", trailing_comma=True)
+    with robot.board() as board:
+        assert watchdog.finding(board, ALL).figure.endswith("damaged lines keep it from acting")
+    commands = [protocol.latched(line).values.values() for _, line in robot.mcu.heard]
+    assert max(abs(value) for values in commands for value in values) == SPEED
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("fault", [(), ("no_check",)])
+@pytest.mark.parametrize("per_turn", [16, 24, 48, 96])
+@pytest.mark.parametrize("time_s", [0.3, 0.52])
+def test_a_time_measured_too_coarsely_to_judge_does_not_pass(
+    fault: tuple[str, ...], per_turn: int, time_s: float
+) -> None:
+    robot = Robot(*fault, config=Config(sim=SimConfig(encoder_counts=per_turn)))
+    robot.mcu.watchdog_ns = int(time_s * 1e9)
+    verdict, figure = measured(robot)
+    middle, _, about = figure.removesuffix(" ms").partition(" ms ± ")
+    assert int(middle) == pytest.approx(1000 * time_s, abs=int(about) + 15)
+    reaches = int(middle) + int(about) > 500
+    if verdict == "PASS":
+        assert time_s == 0.3
+        assert not reaches
+    else:
+        assert reaches
+        assert time_s != 0.3 or verdict == "WARN"
+
+
+# Lines.
+
+
+def run_earlier_steps(board: Board) -> None:
+    """Run the steps of the check that come before the count of lost lines."""
+    for step in (dialect.baud, dialect.rate, dialect.check):
+        step(board)
+
+
+@pytest.mark.parametrize(("every", "verdict"), [(25, "FAIL"), (40, "FAIL"), (70, "PASS")])
+@pytest.mark.parametrize("way", ["lose_reply", "lose_command"])
+def test_a_loss_of_more_than_two_percent_fails(way: str, every: int, verdict: str) -> None:
+    robot = Robot()
+    setattr(robot.mcu, way, every)
+    with robot.board() as board:
+        run_earlier_steps(board)
+        assert line_loss.finding(board).verdict == verdict
+
+
+def test_a_board_whose_plain_lines_arrive_damaged_ends_the_check_before_motors_turn() -> None:
+    class Noisy(Robot):
+        pieces = 0
+
+        def listen(self, until_ns: int) -> list[tuple[int, bytes]]:
+            chunks = super().listen(until_ns)
+            self.pieces += len(chunks)
+            return [
+                (at, d[:9] + b"\xae" + d[10:] if self.pieces % 9 == 0 else d) for at, d in chunks
+            ]
+
+    robot = Noisy("plain_only")
+    with robot.board() as board:
+        run_earlier_steps(board)
+        with pytest.raises(StoppedError) as end:
+            line_loss.finding(board)
+    assert "arrived damaged from the board, the last one is `" in end.value.finding.text
+    assert "ground" in end.value.finding.mend
+    assert robot.mcu.vehicle.angles == [0.0] * 4
+
+
+@pytest.mark.parametrize("comma", [False, True])
+@pytest.mark.parametrize("sealed", [False, True])
+def test_the_parser_refuses_every_broken_line(comma: bool, sealed: bool) -> None:
+    lines = damage.broken_lines(comma, sealed, [0, 1, 2, 3])
+    assert len(lines) == (12 if sealed else 10)
+    assert all(any(line.endswith(end) for _, line in lines) for end in (b"dp03.0\r\n", b"dp0\r\n"))
+    for what, line in lines:
+        assert protocol.reference(line) is None, what
+        if "last number" in what:
+            continue  # the host also reads replies with another number of decimals
+        with pytest.raises(FrameError):
+            Codec(WheelMap()).decode(line.rstrip())
+
+
+def test_firmware_that_reads_a_last_number_that_is_cut_is_reported() -> None:
+    def scanned(line: bytes) -> protocol.Command | None:
+        """Parse as `sscanf` does: accept a last number whose end is missing."""
+        match = re.match(rb"ap(\d\d\.\d\d),bp(\d\d\.\d\d),cp(\d\d\.\d\d),dp([\d.]+),?\r\n\Z", line)
+        return match and protocol.Command({m: float(match[m + 1]) for m in range(4)})
+
+    robot = Robot()
+    with robot.board() as board:
+        robot.mcu.understand = scanned
+        finding = damage.finding(board, [0, 1, 2, 3])
+    assert finding.verdict == "FAIL"
+    assert finding.text.count("cut inside the last number") == 1
+
+
+def test_motors_that_do_not_turn_as_commanded_are_left_out() -> None:
+    lines = damage.broken_lines(False, False, [1])
+    assert all(b"ap03" not in line for _, line in lines)
+    assert any(b"bp03" in line for _, line in lines)
+    with Robot().board() as board:
+        assert damage.finding(board, []).verdict == "SKIPPED"
+
+
+def test_rare_reports_by_the_boards_own_clock_are_not_taken_for_answers() -> None:
+    for wait_ms in range(0, 400, 50):
+        robot = Robot("plain_only")
+        with robot.board() as board, robot.mcu.free_running(0.4):
+            board.listen(wait_ms / 1000)
+            assert dialect.form(board) is None
+            assert not board.comma
+
+
+@pytest.mark.parametrize("period_s", [0.26, 0.74])
+def test_a_reply_period_that_the_configuration_refuses_is_not_advised(period_s: float) -> None:
+    with Robot().board() as board, board.wire.mcu.sparse_replies(period_s):  # type: ignore[attr-defined]
+        board.armed = False
+        rate = dialect.rate(board)
+    assert (rate.verdict, rate.keys) == ("FAIL", {})
+    assert "mcu.reply_period" not in rate.mend
+    assert rate.mend.endswith("at least every 0.25 s")
+
+
+def test_the_advised_reply_period_is_not_rounded_above_the_limit(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(dialect, "MAX_REPLY_PERIOD_S", 0.15)
+    with Robot().board() as board, board.wire.mcu.sparse_replies(0.12):  # type: ignore[attr-defined]
+        rate = dialect.rate(board)
+    period = rate.keys["mcu.reply_period"]
+    assert isinstance(period, float)
+    assert 0.1 <= period <= 0.15
+
+
+def test_every_diagnosis_of_the_received_bytes_has_an_outcome_of_its_own() -> None:
+    for code in get_args(ReceivedCode):
+        finding = find(f"baud rate: {code}", heard="2 lines", configured=115200)
+        assert finding.verdict == "FAIL", code
