@@ -13,7 +13,7 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import pytest
 
@@ -301,23 +301,6 @@ def test_releasing_the_left_mouse_button_while_another_is_held_releases_the_stic
     finally:
         mouse("Released", 90, "right", 0)
     page.shows("hint", "another button is down")
-
-
-COARSE = """(() => {
-    const now = performance.now.bind(performance);
-    performance.now = () => Math.floor(now() / 100) * 100;
-})();1"""
-"""The clock of a browser that tells no page the exact time."""
-
-
-@alone
-def test_a_browser_with_a_clock_resolution_of_a_tenth_of_a_second_drives_and_stops(
-    page: Phone,
-) -> None:
-    page.browser.js(COARSE)
-    page.hold()
-    page.browser.touch("End")
-    page.bus.at_rest()
 
 
 JAM = """(() => {
@@ -778,41 +761,6 @@ def test_the_dials_show_command_and_measurement_in_one_line_and_offer_degrees(pa
     assert browser.text("turn") == "0.00 rad/s"
 
 
-FOLDED = """import('/page/views.js').then(({folded}) => folded([
-    {name: 'refused', level: 'warning', text: 'a', by: ''},
-    {name: 'refused', level: 'warning', text: 'a', by: ''},
-    {name: 'refused', level: 'warning', text: 'b', by: ''},
-    {name: 'refused', level: 'warning', text: 'a', by: ''},
-]).map(one => [one.text, one.equal]))"""
-
-
-def test_equal_consecutive_events_are_shown_once_with_a_count(page: Phone) -> None:
-    assert page.browser.js(FOLDED) == [["a", 2], ["b", 1], ["a", 1]]
-
-
-PERSON = """import('/page/words.js').then(({person}) => [
-    person('here/0123456789abcdef', 'here/0123456789abcdef'),
-    person('here/0123456789abcdef', 'here/fedcba9876543210'),
-    person('phone/0123456789abcdef [robot]', 'here/fedcba9876543210'),
-    person('phone/0123456789abcdef [robot]', 'phone/fedcba9876543210 [robot]'),
-    person('0123456789abcdef'), person('session 0123456789abcdef'), person('unnamed'),
-    person('session 0123456789abcdef [laptop]'), person('0b5d (rmw)')])"""
-
-
-def test_a_sender_is_shown_by_a_name_that_a_person_knows(page: Phone) -> None:
-    assert page.browser.js(PERSON) == [
-        "you",
-        "another page on the robot itself",
-        "phone",
-        "another page of phone",
-        "a program without a name",
-        "a program without a name",
-        "a program without a name",
-        "laptop",
-        "0b5d (rmw)",
-    ]
-
-
 def test_a_refusal_of_a_button_disappears_when_the_mode_changes(page: Phone) -> None:
     page.browser.tap("tab-set")
     until(lambda: page.browser.js(SET.replace("0,31", "fast")), 5.0, "the setting is there")
@@ -1048,109 +996,6 @@ def test_the_first_visit_loads_little_and_the_second_one_less(page: Phone, tmp_p
     assert second.ms < 15 * bare_ms + 500.0
 
 
-COMMANDER = """import('/page/commander.js').then(({Commander, ZERO, twist}) => {
-    const ours = {name: 'teleop', waits_for: '', wait: 'nothing'};
-    const driving = {
-        mode: 'driving', source: 'teleop', sender: 'me', reason: '', sources: [ours],
-        link: 'up', causes: [],
-    };
-    const ready = {...driving, mode: 'ready', source: '', sender: '', reason: 'no commands'};
-    const stopped = {...ready, mode: 'stopped', reason: 'stopped by request'};
-    const out = [];
-    const commander = new Commander();
-    const look = (now, state) => {
-        const {send, ended} = commander.look(now, state, now, 'teleop', 'me');
-        out.push([send ? send.linear_x : null, ended ?? null]);
-    };
-    SCRIPT
-    return out;
-})"""
-
-
-def commanded(page: Phone, script: str) -> list[Any]:
-    """Run a script on the page's command logic in the browser, and return the results."""
-    return list(page.browser.js(COMMANDER.replace("SCRIPT", script)))
-
-
-STOPPING = """(async () => {
-    const out = [], now = Date.now;
-    let ok = false, lost = true;
-    const send = async () => (out.push("sent"), {ok, lost, text: "no answer"});
-    const stopping = new Stopping(send, (told) => out.push(told));
-    const pressed = stopping.press();
-    await new Promise((done) => setTimeout(done, 100)); // it was sent once
-    SCRIPT
-    await pressed;
-    Date.now = now;
-    delete performance.now;
-    return out;
-})()"""
-
-FAILS = [
-    "sent",
-    "STOP is not confirmed. This page sends it again; the robot's own switch stops it too.",
-]
-"""The expected trace of a first attempt that gets no answer."""
-
-SLOW = """let answer;
-    stopping.send = () => new Promise((done) => { answer = done; });
-    while (!answer) await new Promise((done) => setTimeout(done, 10));
-    stopping.over(); """
-"""Gives up the STOP while the second attempt waits for its answer."""
-
-
-@pytest.mark.parametrize(
-    ("script", "then"),
-    [
-        ("ok = true", ["sent", ""]),
-        ("stopping.over()", ["STOP was not confirmed"]),
-        ("stopping.over(); stopping.complete(); stopping.lacks()", ["STOP was not confirmed"]),
-        ("Date.now = () => now() + 31000", ["STOP was not confirmed"]),
-        (
-            "const then = performance.now(); Date.now = () => now() - 3600000;"
-            "performance.now = () => then + 31000",
-            ["STOP was not confirmed"],
-        ),
-        ("ok = true; stopping.press()", ["sent", ""]),
-        (
-            "lost = false; await new Promise((done) => setTimeout(done, 300)); ok = true",
-            [*FAILS, "sent", ""],
-        ),
-        (SLOW + "answer({ok: true})", ["STOP was not confirmed", ""]),
-        (SLOW + "answer({ok: false})", ["STOP was not confirmed"]),
-        (
-            "const given = stopping.over(); stopping.over(); stopping.released(given)",
-            ["STOP was not confirmed", "STOP was not confirmed", ""],
-        ),
-        (
-            "const given = stopping.over(); ok = true; const again = stopping.press();"
-            "stopping.released(given); await again",
-            ["STOP was not confirmed", "sent", ""],
-        ),
-    ],
-    ids=[
-        "answered",
-        "cleared",
-        "cleared before the page is complete",
-        "asleep",
-        "a clock set back",
-        "pressed again",
-        "answered: not ended yet",
-        "answered after the release was pressed",
-        "not answered after the release was pressed",
-        "released twice and the first release is confirmed",
-        "pressed again before the release is confirmed",
-    ],
-)
-def test_a_stop_is_repeated_until_it_arrives_and_never_sent_long_after_the_press(
-    page: Phone, script: str, then: list[str]
-) -> None:
-    entries = list(page.browser.js(STOPPING.replace("SCRIPT", script)))
-    assert entries[:2] == FAILS
-    assert len(entries) == 2 + len(then), entries
-    assert all(entry.startswith(begun) for entry, begun in zip(entries[2:], then, strict=True))
-
-
 def test_a_page_that_is_hidden_sends_its_zero_once(page: Phone) -> None:
     """A hidden page does not repeat the zero, because its timers run late.
 
@@ -1165,62 +1010,6 @@ def test_a_page_that_is_hidden_sends_its_zero_once(page: Phone) -> None:
     page.bus.at_rest()
     sent = [json.loads(message) for _, message in page.browser.js("window.sent")]
     assert [message["cmd"]["linear_x"] for message in sent if "cmd" in message] == [0]
-
-
-def test_a_commander_opens_with_zeros_drives_at_20_hz_and_ends_with_one_zero(page: Phone) -> None:
-    script = """commander.press(0); commander.wish(0.2, 0);
-        for (const now of [0, 10, 20, 40]) look(now, ready);
-        for (let now = 50; now < 260; now += 10) look(now, driving);
-        out.push([commander.release()?.linear_x, null], [commander.release(), null]);
-        look(270, driving);"""
-    pairs = commanded(page, script)
-    assert pairs[:4] == [[0, None], [None, None], [0, None], [0, None]]
-    sent = [pair[0] for pair in pairs[4:25]]
-    assert set(sent) == {0.2, None}
-    assert sent.count(0.2) == 4
-    assert pairs[25:] == [[0, None], [None, None], [None, None]]
-
-
-@pytest.mark.parametrize(
-    ("script", "why"),
-    [
-        ("commander.press(0); look(0, ready); look(1100, ready)", "This page was suspended"),
-        ("commander.press(0); look(0, stopped)", "Stopped. Press Release STOP first."),
-        (
-            "commander.press(0); for (let now = 0; now <= 2100; now += 100) look(now, null)",
-            "Nothing is received",
-        ),
-        (
-            "commander.press(-1); look(0, driving);"
-            "for (let now = 100; now <= 600; now += 100)"
-            " look(now, {...driving, sender: 'other'})",
-            "other drives",
-        ),
-    ],
-)
-def test_a_commander_that_is_not_obeyed_sends_a_zero_and_says_why(
-    page: Phone, script: str, why: str
-) -> None:
-    pairs = commanded(page, script)
-    assert pairs[-1][0] == 0
-    assert why in json.dumps(pairs[-1][1])
-    assert all(pair[1] is None for pair in pairs[:-1])
-
-
-def test_a_robot_that_may_only_turn_is_turned_slowly(page: Phone) -> None:
-    for linear, turn in ((1, -0.8), (0, -0.4)):
-        script = f"out.push(...twist(1, 0, 0.2, {{linear: {linear}, angular: 4}}))"
-        assert commanded(page, script)[1] == pytest.approx(turn)
-
-
-READ = """import('/page/settings.js').then(({read}) => [
-    read('0,5', 0.2), read(' −1.5 ', 0.2), read('fast', 0.2), read('', 0.2),
-    read('info', 'debug')])"""
-
-
-def test_a_typed_comma_is_a_decimal_separator(page: Phone) -> None:
-    values = page.browser.js(READ)
-    assert values == [0.5, -1.5, "fast", "", "info"]
 
 
 @alone

@@ -78,37 +78,6 @@ def test_a_page_that_has_not_shown_a_stop_does_not_release_it(
             daemon.signal(signal.SIGCONT)
 
 
-STILL = """import('/page/commander.js').then(({still}) => still(
-    {mode: MODE, link: 'up', source: SOURCE, sender: 'joy/0123456789abcdef', sources: SOURCES},
-    'teleop', 'here/0123456789abcdef'))"""
-
-TELEOP = "{name: 'teleop', priority: 50}"
-
-
-@pytest.mark.parametrize(
-    ("mode", "source", "others", "words"),
-    [
-        ("driving", "safety", "{name: 'safety', priority: 60}", "joy (safety) drives and has"),
-        ("driving", "nav", "{name: 'nav', priority: 50}", "joy (nav) drives and has priority"),
-        ("driving", "nav", "{name: 'nav', priority: 10}", ""),
-        ("ready", "", "{name: 'safety', priority: 60}", ""),
-    ],
-)
-def test_the_stick_is_grey_while_a_source_with_higher_priority_drives(
-    page: Page, browser: Browser, mode: str, source: str, others: str, words: str
-) -> None:
-    asked = STILL.replace("MODE", repr(mode)).replace("SOURCES", f"[{TELEOP}, {others}]")
-    reason = browser.js(asked.replace("SOURCE", repr(source)))
-    assert reason.startswith(words) if words else reason == ""
-
-
-def test_the_stick_is_grey_on_a_robot_that_has_no_source_for_it(
-    page: Page, browser: Browser
-) -> None:
-    asked = STILL.replace("MODE", "'ready'").replace("SOURCES", "[{name: 'joy', priority: 1}]")
-    assert "teleop is not one of its sources" in browser.js(asked.replace("SOURCE", "''"))
-
-
 @pytest.fixture(scope="module")
 def robot(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Daemon, Bus, Peer, Page]]:
     where = tmp_path_factory.mktemp("words")

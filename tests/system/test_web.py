@@ -46,7 +46,7 @@ from tests.system.harness import (
     until,
     write_config,
 )
-from tests.unit.web import described
+from tests.unit import page_schemas
 
 
 @pytest.fixture
@@ -103,11 +103,13 @@ async def test_every_message_of_the_socket_is_described_and_every_described_one_
             finally:
                 daemon.signal(signal.SIGCONT)
             messages.extend(ours.heard)
-    kinds = described.kinds(messages)
-    assert kinds >= set(described.FRAMES), set(described.FRAMES) - kinds
+    kinds = page_schemas.kinds(messages)
+    assert kinds >= set(page_schemas.FRAMES), set(page_schemas.FRAMES) - kinds
     for example in {frozenset(frame): frame for frame in messages}.values():
         assert [
-            spoilt for spoilt in described.spoilt(example) if described.is_described_frame(spoilt)
+            spoilt
+            for spoilt in page_schemas.spoilt(example)
+            if page_schemas.is_described_frame(spoilt)
         ] == []
 
 
@@ -175,7 +177,7 @@ async def test_each_http_answer_is_as_described(page: Page, bus: Bus) -> None:
     statuses: dict[tuple[str, str], int] = {}
     async with aiohttp.ClientSession(page.here) as session:
         name = await first_recording(session)
-        for path, operations in described.DOCUMENT["paths"].items():
+        for path, operations in page_schemas.DOCUMENT["paths"].items():
             asked = path.replace("{name}", name).replace("{type}", "Twist")
             for method in operations:
                 async with session.request(method, asked) as answer:
@@ -183,9 +185,9 @@ async def test_each_http_answer_is_as_described(page: Page, bus: Bus) -> None:
                     body = await answer.json() if media == "application/json" else None
                 statuses[method, path] = answer.status
                 response = path, method, answer.status, media, body
-                assert described.answers(*response), response
+                assert page_schemas.answers(*response), response
                 if path in TYPED:
-                    assert not described.answers(*response[:4], {"of": "nothing"}), path
+                    assert not page_schemas.answers(*response[:4], {"of": "nothing"}), path
     assert {endpoint for endpoint in statuses if statuses[endpoint] == 200} > {
         ("get", path) for path in TYPED
     }

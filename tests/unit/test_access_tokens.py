@@ -1,0 +1,239 @@
+"""Only hashes of tokens are stored, only their owner can read them, and they expire."""
+
+from __future__ import annotations
+
+import errno
+import json
+import os
+import stat
+import time
+from pathlib import Path
+
+import msgspec
+import pytest
+from msgspec.structs import replace
+
+from acsard.host.errors import MendableError, NotPermittedError, UsageError
+from acsard.web import tokens
+from acsard.web.callers import AdmittedClient
+from acsard.web.tokens import ReadTokens, Token, Vault
+
+
+def owner(vault: Vault, text: str) -> AdmittedClient | None:
+    """Return the owner of a token by the file as it is now."""
+    return read(vault).owner([text])
+
+
+def read(vault: Vault) -> ReadTokens:
+    tokens = ReadTokens(vault)
+    tokens.read()
+    return tokens
+
+
+def digests(vault: Vault) -> set[str]:
+    return {token.digest for token in vault.valid()}
+
+
+def test_a_token_is_valid_until_it_is_revoked(tmp_path: Path) -> None:
+    keeper, server = Vault(tmp_path / "state", "robot1"), Vault(tmp_path / "state", "robot1")
+    assert server.all() == []
+    text, _ = keeper.invite("operator", "phone", 30)
+    found = owner(server, text)
+    assert found is not None
+    assert (found.role, found.name) == ("operator", "phone")
+    assert found.token in digests(server)
+    keeper.revoke("phone")
+    assert owner(server, text) is None
+    assert found.token not in digests(server)
+
+
+def test_the_token_itself_is_not_stored_on_the_disk(tmp_path: Path) -> None:
+    vault = Vault(tmp_path / "state", "robot1")
+    text, _ = vault.invite("viewer", "tv", 1)
+    contents = b"".join(path.read_bytes() for path in tmp_path.rglob("*") if path.is_file())
+    assert text.encode() not in contents
+    assert stat.S_IMODE(vault.path.stat().st_mode) == 0o600
+    assert stat.S_IMODE(vault.path.parent.stat().st_mode) == 0o700
+
+
+def test_an_expired_token_is_not_valid(tmp_path: Path) -> None:
+    vault = Vault(tmp_path, "robot1")
+    text, token = vault.invite("viewer", "tv", 1)
+    ended = {"tokens": [replace(token, ends=token.made - 1)]}
+    vault.path.write_bytes(msgspec.json.encode(ended))
+    assert owner(vault, text) is None
+    assert token.digest not in digests(vault)
+
+
+@pytest.mark.parametrize("text", ["", "x", "x" * 10_000, "ü", "\0", "\udcff"])
+def test_an_unknown_token_is_not_valid(tmp_path: Path, text: str) -> None:
+    vault = Vault(tmp_path, "robot1")
+    vault.invite("viewer", "tv", 1)
+    assert owner(vault, text) is None
+
+
+def test_with_a_damaged_file_no_token_is_valid(tmp_path: Path) -> None:
+    vault = Vault(tmp_path, "robot1")
+    text, _ = vault.invite("maintainer", "me", 1)
+    whole = vault.path.read_bytes()
+    for damaged in (whole[:-3], whole.replace(b'"me"', '"mü"'.encode("latin-1")), b"[" * 100_000):
+        vault.path.write_bytes(damaged)
+        assert owner(vault, text) is None
+        assert digests(vault) == set()
+        with pytest.raises(UsageError, match="does not hold tokens"):
+            vault.invite("viewer", "tv", 1)
+
+
+def test_a_role_and_a_field_of_a_later_version_leave_the_other_tokens_valid(tmp_path: Path) -> None:
+    vault = Vault(tmp_path, "acsar")
+    text, token = vault.invite("operator", "phone", 1)
+    pilot, other = vault.invite("viewer", "pilot", 1)
+    content = json.loads(vault.path.read_bytes())
+    rows = content["tokens"]
+    rows[0]["later"], rows[1]["role"], content["later"] = 1, "pilot", 2
+    vault.path.write_text(json.dumps(content))
+    assert digests(vault) == {token.digest, other.digest}
+    assert owner(vault, text) == AdmittedClient("operator", "phone", token.digest)
+    assert owner(vault, pilot) is None
+    vault.revoke("pilot")
+    content = json.loads(vault.path.read_bytes())
+    (row,) = content["tokens"]
+    assert (row["name"], row["later"], content["later"]) == ("phone", 1, 2)
+
+
+def test_an_expired_token_is_deleted_so_it_stays_expired_after_a_start_without_the_time(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    now_s = 1_800_000_000.0
+    monkeypatch.setattr(time, "time", lambda: now_s)
+    vault = Vault(tmp_path, "robot1")
+    text, token = vault.invite("maintainer", "me", 1)
+    other, _ = vault.invite("viewer", "tv", 30)
+    now_s = token.ends - 0.1
+    assert owner(vault, text) is not None
+    now_s = token.ends
+    assert owner(vault, text) is None
+    now_s = 5.0  # a clock without a battery begins in 1970
+    server = Vault(tmp_path, "robot1")
+    assert owner(server, text) is None
+    assert read(server).left_s(token.digest) == 0
+    assert owner(server, other) is not None
+
+
+def test_a_disk_that_cannot_delete_a_token_leaves_the_others_valid(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    vault = Vault(tmp_path, "robot1")
+    _, ended = vault.invite("viewer", "guest", 1)
+    _, token = vault.invite("viewer", "tv", 2)
+    monkeypatch.setattr(time, "time", lambda: float(ended.ends))
+
+    def full(*_: object, **__: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(tokens, "replace", full)
+    assert digests(vault) == {token.digest}
+
+
+def test_a_damaged_file_is_not_written_over(tmp_path: Path) -> None:
+    vault = Vault(tmp_path, "robot1")
+    vault.invite("maintainer", "me", 1)
+    damaged = vault.path.read_bytes()[:-3]
+    vault.path.write_bytes(damaged)
+    for change in (lambda: vault.invite("viewer", "tv", 1), lambda: vault.revoke("me")):
+        with pytest.raises(UsageError, match="does not hold tokens"):
+            change()
+    assert vault.path.read_bytes() == damaged
+
+
+def test_an_invitation_beside_a_service_warns_that_the_service_lacks_the_token(
+    tmp_path: Path,
+) -> None:
+    own, service = Vault(tmp_path / "own", "robot1"), tmp_path / "service"
+    assert own.unknown_to(service) == ""
+    service.mkdir()
+    assert "sudo" in own.unknown_to(service)
+    assert Vault(service, "robot1").unknown_to(service) == ""
+
+
+def test_the_valid_tokens_are_reported_together(tmp_path: Path) -> None:
+    vault = Vault(tmp_path, "robot1")
+    _, first = vault.invite("viewer", "tv", 1)
+    _, second = vault.invite("operator", "phone", 1)
+    assert digests(vault) == {first.digest, second.digest}
+    vault.revoke("tv")
+    assert digests(vault) == {second.digest}
+
+
+def test_a_name_is_given_once_and_an_unknown_one_cannot_be_revoked(tmp_path: Path) -> None:
+    vault = Vault(tmp_path, "robot1")
+    vault.invite("viewer", "tv", 1)
+    with pytest.raises(UsageError, match="web revoke"):
+        vault.invite("operator", "tv", 1)
+    with pytest.raises(UsageError, match="the robot's tokens: tv"):
+        vault.revoke("phone")
+
+
+@pytest.mark.skipif(os.geteuid() == 0, reason="root may write everywhere")
+def test_a_directory_without_write_permission_is_reported(tmp_path: Path) -> None:
+    tmp_path.chmod(0o500)
+    with pytest.raises(NotPermittedError, match="sudo"):
+        Vault(tmp_path / "state", "robot1").invite("viewer", "tv", 1)
+
+
+def test_robots_that_share_the_file_know_their_own_tokens_alone(tmp_path: Path) -> None:
+    first, second = Vault(tmp_path, "robot1"), Vault(tmp_path, "robot2")
+    ours, _ = first.invite("operator", "phone", 1)
+    theirs, token = second.invite("viewer", "phone", 1)
+    assert owner(first, ours) is not None
+    assert owner(second, ours) is None
+    assert owner(first, theirs) is None
+    assert [entry.robot for entry in second.all()] == ["robot2"]
+    assert digests(second) == {token.digest}
+    assert read(first).left_s(token.digest) == 0
+    first.revoke("phone")
+    assert (first.all(), [entry.name for entry in second.all()]) == ([], ["phone"])
+    with pytest.raises(UsageError, match="the robot's tokens: none"):
+        first.revoke("phone")
+
+
+def test_a_record_that_is_not_a_token_is_kept_and_leaves_the_other_tokens_valid(
+    tmp_path: Path,
+) -> None:
+    vault = Vault(tmp_path, "robot1")
+    text, _ = vault.invite("viewer", "tv", 1)
+    content = json.loads(vault.path.read_bytes())
+    strange = {"name": "old", "role": "viewer", "digest": "d", "made": 1, "ends": 2}  # no robot
+    content["tokens"].append(strange)
+    vault.path.write_text(json.dumps(content))
+    assert owner(vault, text) is not None
+    vault.invite("viewer", "phone", 1)
+    assert [token.name for token in vault.all()] == ["tv", "phone"]
+    assert strange in json.loads(vault.path.read_bytes())["tokens"]
+
+
+def test_while_the_disk_hangs_tokens_stay_valid_until_they_expire(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    vault = Vault(tmp_path, "robot1")
+    text, token = vault.invite("viewer", "tv", 1)
+    tokens = read(vault)  # and never again
+    assert tokens.owner(["", "x", text]) == AdmittedClient("viewer", "tv", token.digest)
+    monkeypatch.setattr(time, "time", lambda: float(token.ends))
+    assert tokens.owner([text]) is None
+
+
+@pytest.mark.slow
+def test_a_stored_token_has_only_the_necessary_fields() -> None:
+    assert Token.__struct_fields__ == ("name", "role", "digest", "made", "ends", "robot")
+
+
+def test_a_disk_that_refuses_to_write_is_reported(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(path: Path, *_: object, **__: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(tokens, "replace", full)
+    with pytest.raises(MendableError, match=r"cannot write .*: No space left on device"):
+        Vault(tmp_path, "robot1").invite("viewer", "tv", 1)

@@ -1,0 +1,168 @@
+"""The OpenAPI description has every path, key and message, and each reference leads to a schema."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections import Counter
+from collections.abc import Hashable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from jsonschema import Draft202012Validator
+from openapi_spec_validator import OpenAPIV31SpecValidator
+
+from acsard.core.messages.keys_and_roles import SERVICES, TOPICS, row_of
+from acsard.core.messages.permissions import SERVICE_ROLES, least_role
+from acsard.web.app import ROUTES
+from acsard.web.openapi import FROM_ROBOT, TO_ROBOT, document
+from acsard.web.routes import PARAMETERS, is_queryable
+from acsard.web.socket_messages import MESSAGE_TYPES, FrameError, decode
+from tests.each import each
+
+WHOLE = document("1.2.3", ROUTES)
+
+
+def references(node: Any) -> list[str]:
+    """Return all references in this node."""
+    if isinstance(node, dict):
+        own = [node["$ref"]] if "$ref" in node else []
+        return own + [reference for value in node.values() for reference in references(value)]
+    if isinstance(node, list):
+        return [reference for value in node for reference in references(value)]
+    return []
+
+
+def test_every_key_that_answers_and_every_service_is_described() -> None:
+    paths = WHOLE["paths"]
+    for topic in TOPICS:
+        path = f"/api/{topic.key.replace('<Type>', '{type}')}"
+        assert (path in paths and "get" in paths[path]) == is_queryable(topic), path
+    assert all("post" in paths[f"/api/srv/{verb}"] for verb in SERVICES)
+    assert "requestBody" in paths["/api/srv/set"]["post"]
+
+
+def test_every_reference_leads_to_a_schema() -> None:
+    refs = references(WHOLE)
+    assert len(refs) > 100
+    for reference in refs:
+        name = reference.removeprefix("#/components/schemas/")
+        assert name in WHOLE["components"]["schemas"], reference
+
+
+@pytest.mark.slow
+def test_the_description_is_valid_openapi() -> None:
+    whole: dict[Hashable, Any] = dict(WHOLE.items())
+    assert [error.message for error in OpenAPIV31SpecValidator(whole).iter_errors()] == []
+
+
+@pytest.mark.slow
+def test_every_schema_is_valid_json_schema() -> None:
+    for schema in WHOLE["components"]["schemas"].values():
+        Draft202012Validator.check_schema(schema)
+
+
+PAGE = (Path(__file__).parents[2] / "deploy/web/README.md").read_text()
+
+TO_IT = PAGE.partition("| message to the robot |")[2].partition("| message from the robot |")[0]
+
+MESSAGES = [one for one in re.findall(r"`(\{.*?\})`", TO_IT) if "..." not in one]
+
+
+def test_the_page_has_a_message_of_each_kind() -> None:
+    assert {type(decode(message)) for message in MESSAGES} == set(MESSAGE_TYPES.values())
+
+
+@each("message", [*MESSAGES, "{}", '{"ping": 1, "call": "stop"}', '{"cmd": {}}'])
+def test_the_socket_accepts_exactly_the_messages_that_its_schema_allows(message: str) -> None:
+    schema = {"components": WHOLE["components"], "$ref": f"#/components/schemas/{TO_ROBOT}"}
+    try:
+        decode(message)
+        valid = True
+    except FrameError:
+        valid = False
+    assert Draft202012Validator(schema).is_valid(json.loads(message)) == valid
+
+
+def test_the_socket_and_the_token_are_described() -> None:
+    messages = WHOLE["paths"]["/ws"]["get"]["x-messages"]
+    assert messages["to"]["$ref"].endswith(f"/{TO_ROBOT}")
+    assert messages["from"]["$ref"].endswith(f"/{FROM_ROBOT}")
+    assert set(WHOLE["paths"]["/token"]["post"]["responses"]) >= {"303", "401", "429"}
+
+
+def test_parameters_in_a_path_are_declared() -> None:
+    for path, item in WHOLE["paths"].items():
+        for action in item.values():
+            names = {parameter["name"] for parameter in action.get("parameters", ())}
+            assert names == {part[1:-1] for part in path.split("/") if part.startswith("{")}
+
+
+def test_a_wildcard_is_not_a_valid_type_name() -> None:
+    name = re.compile(PARAMETERS["type"])
+    assert name.fullmatch("Twist")
+    assert not any(map(name.fullmatch, ("*", "**", "a$*", "x?fmt=cdr", "a/b", "", "a" * 99)))
+
+
+def test_each_path_names_the_least_role_that_may_use_it() -> None:
+    def role(path: str, method: str) -> str:
+        here, away = WHOLE["paths"][path][method]["security"]
+        assert here == {}
+        ((least,),) = away.values()
+        return str(least)
+
+    for verb in SERVICES:
+        assert role(f"/api/srv/{verb}", "post") == SERVICE_ROLES[verb]
+    for key in ("state", "config", "info"):
+        assert role(f"/api/{key}", "get") == least_role(key)
+    assert role("/api/recordings/{name}", "get") == "operator"
+    assert WHOLE["paths"]["/token"]["post"]["security"] == [{}]
+
+
+def test_each_message_to_the_robot_names_the_least_role_that_may_send_it() -> None:
+    schemas = WHOLE["components"]["schemas"]
+    least = {kind: schemas[kind.__name__]["x-least-role"] for kind in MESSAGE_TYPES.values()}
+    assert least == {kind: kind.least for kind in MESSAGE_TYPES.values()}
+    assert set(least.values()) == {"viewer", "operator"}
+
+
+def test_each_method_of_a_path_has_one_row() -> None:
+    assert max(Counter((row.method, row.path) for row in ROUTES).values()) == 1
+
+
+def test_only_the_page_s_own_files_and_the_token_are_open_to_strangers() -> None:
+    is_open = {row.path for row in ROUTES if row.least is None}
+    assert is_open == {"/", "/favicon.ico", "/page/{name}", "/token"}
+
+
+def test_only_a_stop_is_served_beyond_the_limits_of_a_token() -> None:
+    assert {row.path for row in ROUTES if row.always} == {"/api/srv/stop"}
+
+
+def test_each_service_has_the_role_that_the_bus_asks_for() -> None:
+    roles = {row.path: row.least for row in ROUTES if row.method == "POST"}
+    assert {verb: roles[f"/api/srv/{verb}"] for verb in SERVICES} == SERVICE_ROLES
+
+
+def test_a_parameter_is_one_part_of_a_path() -> None:
+    for row in ROUTES:
+        parts = [part for part in row.path.split("/") if "{" in part]
+        assert parts == [f"{{{name}}}" for name in row.parameters], row.path
+
+
+def named(cell: str) -> set[tuple[str, str]]:
+    """Return the method with each path that the first cell of a table row on the page names."""
+    method = re.search("GET|POST", cell)
+    return {(method[0], path) for path in re.findall(r"(/\S+)`", cell)} if method else set()
+
+
+def test_the_page_has_a_row_for_each_path_that_programs_may_use() -> None:
+    table = PAGE.partition("| request | meaning |")[2].partition("Over the WebSocket")[0]
+    routes = {
+        route for line in table.splitlines() for route in named("".join(line.split("|")[1:2]))
+    }
+    rows = {(row.method, row.path.replace("{name}", "NAME")) for row in ROUTES if row.summary}
+    of_the_bus = {route for route in rows if row_of(route[1].removeprefix("/api/")) is not None}
+    elsewhere = {("GET", "/api")}  # in a sentence
+    assert routes - of_the_bus - {("GET", "/api/schema/Twist")} == rows - of_the_bus - elsewhere

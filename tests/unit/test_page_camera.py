@@ -1,0 +1,103 @@
+"""The page shows the newest picture of the camera, and each one once."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable
+from unittest.mock import Mock
+
+import pytest
+from aiohttp import StreamReader
+
+from acsard.core.values import NS_PER_S
+from acsard.host import clock
+from acsard.web.camera import STREAM_ERRORS, Camera, pictures
+from tests.each import each
+
+PICTURES = [bytes([0xFF, 0xD8, n]) * (n + 1) + b"\r\n--\r\n\r\n" for n in range(5)]
+"""Contents that look like the borders between pictures."""
+
+
+def measured(picture: bytes) -> bytes:
+    head = f"--frame\r\nContent-Type: image/jpeg\r\nContent-Length: {len(picture)}\r\n\r\n"
+    return head.encode() + picture + b"\r\n"
+
+
+def bare(picture: bytes) -> bytes:
+    return b"--frame\r\nContent-Type: image/jpeg\r\n\r\n" + picture + b"\r\n"
+
+
+async def read(boundary: str, stream: bytes, size: int = 1000) -> list[bytes]:
+    """Return the pictures of a stream that arrives in pieces of this size."""
+    reader = StreamReader(Mock(_reading_paused=False), 2**16)
+
+    async def arrive() -> None:
+        for n in range(0, len(stream), size):
+            reader.feed_data(stream[n : n + size])
+            await asyncio.sleep(0)
+        reader.feed_eof()
+
+    arriving = asyncio.create_task(arrive())
+    kind = f"multipart/x-mixed-replace; boundary={boundary}"
+    try:
+        return [picture async for picture in pictures(kind, reader)]
+    finally:
+        arriving.cancel()
+
+
+@each("boundary", ["frame", '"frame"', "--frame"])
+@each("form", [measured, bare])
+@each("size", [1, 7, 1000])
+async def test_every_picture_is_found_in_pieces_of_any_size(
+    boundary: str, form: Callable[[bytes], bytes], size: int
+) -> None:
+    stream = b"".join(map(form, PICTURES)) + b"--frame--\r\n"
+    assert await read(boundary, stream, size) == PICTURES
+
+
+@each(
+    ("stream", "why"),
+    [
+        (b"x" * 300_000, "more than"),
+        (b"--frame\r\nContent-Length: 99999999\r\n\r\n" + b"x" * 2_000_000, "more than"),
+        (b"--frame\r\n\r\n" + b"x" * 2_000_000, "more than"),
+    ],
+)
+async def test_a_stream_that_would_fill_the_memory_is_an_error(stream: bytes, why: str) -> None:
+    with pytest.raises(STREAM_ERRORS, match=why):
+        await read("frame", stream, 65536)
+
+
+@each(
+    "part",
+    [
+        b"Content-Length: 9\r\n\r\nabc",
+        b"Content-Length: -9\r\n\r\nabc",
+        b"no header\r\n\r\nabc",
+        b"\xff: \xff\r\n\r\nabc",
+        b"A: b\r\n" * 500 + b"\r\n",
+        b"Content-Type: multipart/mixed\r\n\r\n--x",
+    ],
+)
+async def test_a_damaged_stream_is_an_error_that_the_camera_expects(part: bytes) -> None:
+    with pytest.raises(STREAM_ERRORS):
+        await read("frame", b"--frame\r\n" + part)
+
+
+async def test_an_answer_that_is_not_a_stream_is_an_error() -> None:
+    reader = StreamReader(Mock(_reading_paused=False), 2**16)
+    with pytest.raises(ValueError, match="'text/html', not an MJPEG stream"):
+        await anext(pictures("text/html", reader))
+
+
+async def test_a_camera_that_no_client_asked_for_in_a_suspend_is_idle(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    camera = Camera("http://127.0.0.1:1/")
+    camera._take(b"picture")
+    await camera.after(0)
+    camera.close()
+    assert not camera._idle()
+    slept_ns = clock.asleep_ns() + 3600 * NS_PER_S
+    monkeypatch.setattr(clock, "asleep_ns", lambda: slept_ns)
+    assert camera._idle()

@@ -1,0 +1,146 @@
+"""The server's connections are bounded in total, from each network, and with each token."""
+
+from __future__ import annotations
+
+import asyncio
+import socket
+from asyncio import sslproto
+from collections.abc import AsyncIterator
+from contextlib import ExitStack, asynccontextmanager
+from pathlib import Path
+from typing import cast
+from unittest.mock import Mock
+
+import pytest
+from aiohttp import web
+
+from acsard.host.rate_limits import Places
+from acsard.web import connections
+from acsard.web.access import REQUEST_RATE
+from acsard.web.connections import (
+    HANDSHAKE_S,
+    IDLE_S,
+    MAX_CONNECTIONS,
+    MAX_LOCAL,
+    MAX_OF_NETWORK,
+    MAX_OF_TOKEN,
+    UNREAD_S,
+    Connections,
+    HttpConnection,
+)
+from acsard.web.metrics import Counts
+
+
+async def _not_found(request: web.BaseRequest) -> web.Response:
+    return web.Response(status=404)
+
+
+@asynccontextmanager
+async def accepting(counts: Counts) -> AsyncIterator[tuple[str, int]]:
+    """Accept connections on loopback, and yield the address."""
+    served = Connections(counts)
+    with socket.create_server(("127.0.0.1", 0)) as listening:
+        listening.setblocking(False)
+        work = asyncio.create_task(served.accept(web.Server(_not_found), listening, None))
+        try:
+            yield listening.getsockname()
+        finally:
+            work.cancel()
+            served.close()
+
+
+async def is_open(reader: asyncio.StreamReader) -> bool:
+    try:
+        return await asyncio.wait_for(reader.read(1), 0.2) != b""
+    except TimeoutError:
+        return True
+
+
+async def test_a_connection_beyond_the_limit_is_closed_and_the_next_has_the_place_of_one_that_left(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(connections, "MAX_LOCAL", 3)
+    counts = Counts()
+    async with asyncio.timeout(20.0), accepting(counts) as (host, port):
+        opened = [await asyncio.open_connection(host, port) for _ in range(4)]
+        assert [await is_open(reader) for reader, _ in opened] == [True, True, True, False]
+        assert counts.refused() == {"crowded": 1}
+        opened[0][1].close()
+        await asyncio.sleep(0.1)
+        reader, writer = await asyncio.open_connection(host, port)
+        writer.write(b"GET / HTTP/1.1\r\nHost: localhost\r\n\r\n")
+        assert (await reader.readline()).split()[1] == b"404"
+        for _, writer in opened:
+            writer.close()
+
+
+class Owned:
+    """The connections of one token."""
+
+    def __init__(self, count: int) -> None:
+        self.all = Connections(Counts())
+        self.made = [self.new() for _ in range(count)]
+        for connection in self.made:
+            assert self.all.claim(connection, "phone")
+
+    def new(self) -> HttpConnection:
+        server, places = web.Server(_not_found), Places(MAX_CONNECTIONS, MAX_OF_NETWORK)
+        connection = HttpConnection(self.all, server, "192.168.1.9", places)
+        connection.transport = Mock(get_write_buffer_size=lambda: 0)
+        return connection
+
+    def aborted(self) -> list[HttpConnection]:
+        return [one for one in self.made if cast(Mock, one.transport).abort.called]
+
+
+async def test_a_token_with_all_its_connections_loses_an_idle_one_to_a_new_one() -> None:
+    """The idle connections of a phone that has changed its network must not lock it out."""
+    owned = Owned(MAX_OF_TOKEN)
+    with owned.made[0].serving():
+        newcomer = owned.new()
+        assert owned.all.claim(newcomer, "phone")
+        assert owned.all.claim(newcomer, "phone")  # its next request
+    assert owned.aborted() == [owned.made[1]]
+
+
+async def test_a_token_whose_connections_are_all_busy_gets_no_further_one() -> None:
+    owned = Owned(MAX_OF_TOKEN)
+    with ExitStack() as stack:
+        for connection in owned.made:
+            stack.enter_context(connection.serving())
+        assert not owned.all.claim(owned.new(), "phone")
+        assert owned.all.claim(owned.new(), "tv")  # another token has its own
+    assert owned.aborted() == []
+
+
+async def test_a_tls_connection_that_was_closed_twice_gives_its_place_to_a_new_one() -> None:
+    """A WebSocket's end closes it twice. Until it is gone, it must not fail a stop of its token."""
+    owned = Owned(MAX_OF_TOKEN)
+    closed = sslproto._SSLProtocolTransport(asyncio.get_running_loop(), Mock())
+    closed.close()
+    closed.close()
+    owned.made[0].transport = closed
+    assert owned.all.claim(owned.new(), "phone")
+
+
+async def test_all_connections_of_a_token_end_and_a_socket_gets_the_reason() -> None:
+    owned, reasons = Owned(3), list[str]()
+    owned.made[1].end = reasons.append
+    owned.all.end("tv", "too fast")
+    owned.all.end("phone", "too fast", but=owned.made[2])
+    assert owned.aborted() == [owned.made[0]]
+    assert reasons == ["too fast"]
+
+
+def test_the_manual_states_the_limits() -> None:
+    page = Path(__file__).parents[2] / "deploy" / "web" / "README.md"
+    text = " ".join(page.read_text(encoding="utf-8").split())
+    for words in (
+        f"{MAX_CONNECTIONS} connections from other machines, {MAX_OF_NETWORK} of them from one",
+        f"another {MAX_LOCAL} from the machine itself",
+        f"A token has at most {MAX_OF_TOKEN} connections",
+        f"handshake may take {HANDSHAKE_S:g} s, and each request {IDLE_S:g} s",
+        f"leaves its answers unread for {UNREAD_S:g} s",
+        f"{REQUEST_RATE.hz:g} requests a second, and {REQUEST_RATE.burst:g} at once",
+    ):
+        assert words in text

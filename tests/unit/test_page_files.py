@@ -1,0 +1,138 @@
+"""The page's server sends plain file names only, and compresses files if this helps."""
+
+from __future__ import annotations
+
+import asyncio
+import base64
+import gzip
+import hashlib
+import re
+import ssl
+from contextlib import suppress
+from pathlib import Path
+
+import pytest
+from aiohttp.test_utils import make_mocked_request
+
+from acsard.machine.authority import Authority
+from acsard.web.answers import (
+    INLINED,
+    PAGE_DIRECTORY,
+    cut,
+    file_answer,
+    page_files,
+)
+
+
+@pytest.fixture
+def page(tmp_path: Path) -> Path:
+    page = tmp_path / "page"
+    page.mkdir()
+    (page / "index.html").write_text("<p>robot</p>" * 200)
+    (page / "stop.js").write_text("stop()")
+    (page / "style.css").write_text("p { margin: 0 }")
+    (page / "small.js").write_text("1")
+    (page / "notes.txt").write_text("not served")
+    (page / ".secret.js").write_text("1")
+    (tmp_path / "above.js").write_text("1")
+    (page / "link.js").symlink_to(tmp_path / "above.js")
+    (page / "inner").mkdir()
+    (page / "inner" / "deep.js").write_text("1")
+    return page
+
+
+def test_a_file_is_sent_compressed_and_with_its_type(page: Path) -> None:
+    file = page_files(page).get("index.html")
+    assert file is not None
+    assert file.kind == "text/html; charset=utf-8"
+    assert file.packed is not None
+    assert gzip.decompress(file.packed) == file.body
+    assert len(file.packed) < len(file.body)
+
+
+def test_a_small_file_is_not_compressed(page: Path) -> None:
+    file = page_files(page).get("small.js")
+    assert file is not None
+    assert file.packed is None
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "../above.js", "/etc/passwd", "inner/deep.js", "inner", "link.js", ".secret.js",
+        "notes.txt", "missing.js", "", ".", "..", "a\0.js", "x" * 5000 + ".js",
+    ],
+)  # fmt: skip
+def test_any_other_path_is_not_found(page: Path, name: str) -> None:
+    assert page_files(page).get(name) is None
+
+
+def test_the_page_has_stop_and_its_style_in_itself_and_allows_them_by_their_hashes() -> None:
+    page = page_files().get("index.html")
+    assert page is not None
+    sources = {
+        "script-src": re.findall(rb"<script>(.*?)</script>", page.body, re.DOTALL),
+        "style-src": re.findall(rb"<style>(.*?)</style>", page.body, re.DOTALL),
+    }
+    assert sources["script-src"] == [(PAGE_DIRECTORY / "stop.js").read_bytes()]
+    assert sources["style-src"] == [(PAGE_DIRECTORY / "style.css").read_bytes()]
+    assert not any(loads in page.body for loads, _ in INLINED["index.html"].values())
+    policy = dict(directive.split(maxsplit=1) for directive in page.policy.split("; ") if directive)
+    for name, (source,) in sources.items():
+        digest = base64.b64encode(hashlib.sha256(source).digest()).decode()
+        assert policy.pop(name) == f"'self' 'sha256-{digest}'"
+    assert not policy
+
+
+def test_a_page_that_the_browser_has_already_keeps_its_policy() -> None:
+    """The headers of a 304 answer replace those in the browser's cache.
+
+    The answer must therefore contain the content security policy again.
+    """
+    page = page_files().get("index.html")
+    assert page is not None
+    first = file_answer(make_mocked_request("GET", "/"), page)
+    again = file_answer(make_mocked_request("GET", "/", {"If-None-Match": page.tag}), page)
+    assert (first.status, again.status) == (200, 304)
+    policies = [response.headers["Content-Security-Policy"] for response in (first, again)]
+    assert policies[0] == policies[1]
+    assert policies[0].endswith(page.policy)
+
+
+def test_any_other_file_allows_no_inline_script() -> None:
+    file = page_files().get("main.js")
+    assert file is not None
+    answer = file_answer(make_mocked_request("GET", "/page/main.js"), file)
+    assert "script-src" not in answer.headers["Content-Security-Policy"]
+    assert "default-src 'self'" in answer.headers["Content-Security-Policy"]
+
+
+@pytest.mark.parametrize("secure", [True, False])
+@pytest.mark.parametrize("closed", [0, 1, 2])
+async def test_a_connection_can_be_cut_however_often_it_was_closed(
+    tmp_path: Path, secure: bool, closed: int
+) -> None:
+    ours = trusted = None
+    if secure:
+        Authority.make(tmp_path, "test", 1, ["127.0.0.1"]).issue(
+            tmp_path / "robot", "robot", ["127.0.0.1"], 1
+        )
+        ours = ssl.create_default_context(ssl.Purpose.CLIENT_AUTH)
+        ours.load_cert_chain(tmp_path / "robot" / "certificate.pem", tmp_path / "robot" / "key.pem")
+        trusted = ssl.create_default_context(cafile=str(tmp_path / "ca.pem"))
+    accepted = asyncio.Queue[asyncio.StreamWriter]()
+    server = await asyncio.start_server(
+        lambda _, writer: accepted.put_nowait(writer), "127.0.0.1", 0, ssl=ours
+    )
+    async with server, asyncio.timeout(5.0):
+        port = server.sockets[0].getsockname()[1]
+        reader, writer = await asyncio.open_connection("127.0.0.1", port, ssl=trusted)
+        transport = (await accepted.get()).transport
+        for _ in range(closed):
+            transport.close()
+        cut(transport)
+        cut(transport)
+        cut(None)
+        with suppress(ConnectionError):
+            assert await reader.read() == b""
+        writer.close()

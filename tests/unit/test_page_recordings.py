@@ -1,0 +1,79 @@
+"""The page lists the recordings of its robot."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from acsard.recording.file import FrameWriter, Head
+from acsard.web.answers import TroubleError
+from acsard.web.callers import RequestRefusedError
+from acsard.web.recordings import BlackBox, Recording, files, rows
+
+
+def test_a_robot_that_has_just_started_has_no_recordings(tmp_path: Path) -> None:
+    """The recorder makes its directory about a second after the daemon's start."""
+    assert files(tmp_path / "record", "acsar") == []
+
+
+def test_a_file_that_the_daemon_deletes_meanwhile_does_not_hide_the_others(
+    tmp_path: Path,
+) -> None:
+    names = ["000001-20261121T070027Z.rec.zst", "000002-20261121T070127Z.rec.zst"]
+    (tmp_path / names[1]).write_bytes(b"")
+    assert [row.name for row in rows(tmp_path / name for name in names)] == names[1:]
+
+
+def test_a_recording_is_listed_with_its_beginning_and_its_duration(tmp_path: Path) -> None:
+    path = tmp_path / "000001-20261121T070027Z.rec.zst"
+    path.write_bytes(b"1234")
+    begin = 1_795_244_427.0
+    os.utime(path, (begin, begin + 60.0))
+    assert rows([path]) == [Recording(path.name, begin, 60.0, 4, being_recorded=False)]
+    os.utime(path)
+    (row,) = rows([path])
+    assert row.being_recorded
+
+
+def test_a_file_in_place_of_the_directory_is_an_error(tmp_path: Path) -> None:
+    (tmp_path / "record").write_text("")
+    with pytest.raises(NotADirectoryError):
+        files(tmp_path / "record", "acsar")
+
+
+@pytest.mark.parametrize("recorded", ["acsar", "robot2"])
+async def test_the_recordings_of_another_robot_are_not_shown_as_those_of_this_one(
+    tmp_path: Path, recorded: str
+) -> None:
+    """A daemon behind a router on this machine has its recordings on a machine of its own."""
+    path = tmp_path / "000001-20261121T070027Z.rec.zst"
+    with path.open("wb") as file:
+        FrameWriter(file).begin(Head("0", recorded, 0, 1, 1))
+    box = BlackBox(robot_with(str(tmp_path)))
+    if recorded == "acsar":
+        assert [row.name for row in await box.rows()] == [path.name]
+        assert await box.find(path.name) == path
+        return
+    with pytest.raises(TroubleError, match="has the recordings of robot2"):
+        await box.rows()
+    with pytest.raises(TroubleError, match="has the recordings of robot2"):
+        await box.find(path.name)
+
+
+def robot_with(directory: str) -> Any:
+    about = SimpleNamespace(recordings=directory)
+    return SimpleNamespace(id="acsar", endpoint="tcp/127.0.0.1:7447", about=about)
+
+
+@pytest.mark.parametrize("directory", ["", "record"])
+async def test_a_fresh_robot_has_an_empty_list_of_recordings(
+    tmp_path: Path, directory: str
+) -> None:
+    box = BlackBox(robot_with(directory and str(tmp_path / directory)))
+    assert await box.rows() == []
+    with pytest.raises(RequestRefusedError, match="does not exist"):
+        await box.find("000001-20261121T070027Z.rec.zst")

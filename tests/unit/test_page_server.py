@@ -1,0 +1,199 @@
+"""The page's server listens where it says, and reads tokens and certificates again."""
+
+from __future__ import annotations
+
+import asyncio
+import io
+import os
+import socket
+import threading
+from concurrent.futures import Future
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from acsard.bus import certificate_watch
+from acsard.bus.tls import KEY
+from acsard.cli import parser, web
+from acsard.core.config.settings import LogConfig
+from acsard.host.errors import CertificateError, InUseError, UsageError
+from acsard.host.logs import Log
+from acsard.host.own_identity import own_addresses
+from acsard.machine.authority import Authority
+from acsard.web import server
+from acsard.web.listen import (
+    Listen,
+    invitations,
+    open_sockets,
+    own_name,
+    page_urls,
+    parse_listen,
+    require_certificate,
+)
+from acsard.web.metrics import Counts
+from acsard.web.server import Certificate
+from acsard.web.tokens import ReadTokens, Vault
+
+OWN = [*own_addresses(), "203.0.113.9", "2001:db8::9"]
+
+
+@pytest.fixture
+def tls(tmp_path: Path) -> str:
+    """Make a certificate for all addresses of this machine and for some that it does not have."""
+    Authority.make(tmp_path / "tls", "test", 1, OWN).issue(tmp_path / "tls", "robot", OWN, 1)
+    return str(tmp_path / "tls")
+
+
+def free_port() -> int:
+    with socket.socket() as sock:
+        sock.bind(("127.0.0.1", 0))
+        return int(sock.getsockname()[1])
+
+
+def reached(port: int, host: str) -> bool:
+    try:
+        socket.create_connection((host, port), 5.0).close()
+    except OSError:
+        return False
+    return True
+
+
+def test_an_address_is_parsed_and_a_remote_one_must_be_https() -> None:
+    assert parse_listen("http://127.0.0.1:8080") == Listen(False, "127.0.0.1", 8080)
+    assert parse_listen("https://[::]:8443/") == Listen(True, "::", 8443)
+    assert parse_listen("https://[::]:8443").url == f"https://{own_name()}:8443/"
+    for wrong in ("127.0.0.1:8080", "http://:80", "http://127.0.0.1:0", "ftp://a:1", "https://a:x"):
+        with pytest.raises(UsageError, match="is not an address"):
+            parse_listen(wrong)
+    with pytest.raises(UsageError, match="use https"):
+        parse_listen("http://0.0.0.0:8080")
+
+
+@pytest.mark.parametrize("host", ["0.0.0.0", "::"])
+def test_an_invitation_has_the_certified_addresses_at_which_the_server_listens(
+    host: str, tls: str
+) -> None:
+    urls = invitations([Listen(True, host, 8443), Listen(False, "127.0.0.1", 8080)], tls)
+    older = [at for at in own_addresses() if ":" not in at]
+    newer = [f"[{at}]" for at in own_addresses() if ":" in at and host == "::"]
+    assert urls == [f"https://{at}:8443/" for at in (*older, *newer, own_name())]
+
+
+def test_the_reported_addresses_of_the_page_are_those_of_an_invitation(tls: str) -> None:
+    away, here = Listen(True, "0.0.0.0", 8443), Listen(False, "127.0.0.1", 8080)
+    assert page_urls(away, tls) == invitations([away], tls)
+    assert f"https://{own_name()}:8443/" in page_urls(away, tls)
+    assert page_urls(here, "") == ["http://127.0.0.1:8080/"]
+
+
+@pytest.mark.parametrize(("host", "by"), [("0.0.0.0", {"127.0.0.1"}), ("::", {"127.0.0.1", "::1"})])
+def test_a_wildcard_address_is_reached_by_ipv4_and_only_the_ipv6_one_by_ipv6(
+    host: str, by: set[str]
+) -> None:
+    [(endpoint, opened)] = open_sockets([Listen(True, host, free_port())], next_port=False)
+    with opened:
+        assert {at for at in ("127.0.0.1", "::1") if reached(endpoint.port, at)} == by
+
+
+def test_a_port_in_use_is_reported_or_the_next_port_is_used() -> None:
+    with socket.socket() as occupant:
+        occupant.bind(("127.0.0.1", 0))
+        occupant.listen()
+        wished = Listen(False, "127.0.0.1", occupant.getsockname()[1])
+        with pytest.raises(
+            InUseError, match=r"cannot listen at \S+: Address already in use; if .* choose another"
+        ):
+            open_sockets([wished], next_port=False)
+        [(endpoint, opened)] = open_sockets([wished], next_port=True)
+        with opened:
+            assert endpoint.port > wished.port
+
+
+def test_https_without_a_certificate_is_reported_and_http_needs_none(tmp_path: Path) -> None:
+    away, here = parse_listen("https://0.0.0.0:8443"), parse_listen("http://127.0.0.1:8080")
+    require_certificate([here], "")
+    with pytest.raises(CertificateError, match="tls init"):
+        require_certificate([here, away], "")
+    with pytest.raises(CertificateError, match="tls init"):
+        require_certificate([away], str(tmp_path))
+
+
+@pytest.mark.parametrize("tls", [(), ("--tls", "nowhere")])
+def test_an_invitation_is_refused_if_the_server_could_not_start(
+    tmp_path: Path, tls: tuple[str, ...], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
+    words = ["web", *tls, "--address", "https://0.0.0.0:8443", "invite", "viewer"]
+    with pytest.raises(CertificateError, match="tls init"):
+        web.main_invite(parser(["web"]).parse_args(words))
+    assert list(tmp_path.iterdir()) == []
+
+
+async def test_one_thread_waits_for_a_hanging_disk_and_then_everything_is_read_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(server, "TICK_S", 0.01)
+    monkeypatch.setattr(certificate_watch, "FILES_CHECK_PERIOD_NS", 0)
+    authority, key = Authority.make(tmp_path, "test", 10), tmp_path / KEY
+    authority.issue(tmp_path, "robot", ["192.168.0.1"], 10)
+    log, vault = Log(LogConfig(), io.StringIO()), Vault(tmp_path / "state", "acsar")
+    text, _ = vault.invite("viewer", "tv", 1)
+    tokens, certificate = ReadTokens(vault), Certificate(str(tmp_path), log)
+    before = certificate.context
+    reading = asyncio.create_task(server._read_disk(tokens, certificate))
+    try:
+        await tokens.next_reading()
+        assert tokens.owner([text]) is not None
+        # A read of a named pipe blocks until another program has written to the pipe.
+        key.unlink()
+        os.mkfifo(key)
+        await asyncio.sleep(0.5)  # fifty attempts, if each had a thread
+        assert [thread.name for thread in threading.enumerate()].count("read") == 1
+        assert tokens.owner([text]) is not None
+        vault.revoke("tv")
+        hanging = os.open(key, os.O_WRONLY)
+        key.unlink()
+        authority.issue(tmp_path, "robot", ["192.168.0.2"], 10)
+        os.close(hanging)
+        async with asyncio.timeout(20.0):
+            while "192.168.0.2" not in certificate.names or tokens.owner([text]):
+                await asyncio.sleep(0.01)
+        assert certificate.context is not before
+    finally:
+        reading.cancel()
+        log.close()
+
+
+async def test_the_connections_of_a_revoked_token_end_with_the_reading_that_misses_it(
+    tmp_path: Path,
+) -> None:
+    log, vault = Log(LogConfig(), io.StringIO()), Vault(tmp_path, "acsar")
+    text, _ = vault.invite("viewer", "tv", 1)
+    tokens, valid = ReadTokens(vault), list[bool]()
+    page: Any = SimpleNamespace(tidy=lambda: valid.append(tokens.owner([text]) is not None))
+    ticking = asyncio.create_task(server._tick(page, tokens, Counts(), log))
+    try:
+        await asyncio.sleep(0)
+        for revokes in (False, True):
+            if revokes:
+                vault.revoke("tv")
+            tokens.read()
+            tokens.announce()
+            await asyncio.sleep(0.01)
+        assert valid == [True, False]
+    finally:
+        ticking.cancel()
+        log.close()
+
+
+async def test_an_error_of_the_outbox_is_reported_even_after_its_future_was_waited_for() -> None:
+    """The end of the server must not cancel the future that reports the error."""
+    outbox: Any = SimpleNamespace(dead=Future())
+    await server.first_ended([asyncio.sleep(0)], outbox)
+    assert not outbox.dead.cancelled()
+    outbox.dead.set_exception(MemoryError("no room"))
+    with pytest.raises(MemoryError):
+        await server.first_ended([asyncio.sleep(60)], outbox)
