@@ -38,7 +38,7 @@ from acsard.web.metrics import Counts
 from acsard.web.streams import Stream, Streams
 from tests.system.harness import until
 from tests.unit.client.test_follower import UNREADABLE, Robot
-from tests.unit.top.screens import INFO, STATE, sample_of
+from tests.unit.screens import INFO, STATE, sample_of
 
 ABOUT = About("1", False, 1.0, 4.0, 10.0, "", {"teleop": 0.25, "app": 0.25})
 
