@@ -49,7 +49,7 @@ OF_A_CLONE = (
     "tests/unit/core/test_codes.py::"
     "test_the_page_lists_the_codes_of_the_sources_with_the_first_words_of_their_texts",
     # With the package's gateway, `tls init` also writes its drop-in.
-    "tests/unit/cli/test_transcripts.py::test_each_command_prints_what_its_transcript_says[tls]",
+    "tests/unit/test_cli_transcripts.py::test_each_command_prints_what_its_transcript_says[tls]",
 )
 
 

@@ -1,4 +1,4 @@
-"""Tests of the words after `acsard set`, which give settings as key=value."""
+"""`acsard set`: values as in the file, how long they last, and --keep."""
 
 from __future__ import annotations
 

@@ -1,9 +1,9 @@
-"""What commands print for people, as transcripts in `transcripts/`.
+"""What commands print for people, as transcripts in `words/transcripts/`.
 
 In a transcript, `$` begins a command, `|` a printed line, `!` a line of standard error and `#` a
 comment. `exit` names an exit code other than 0. All commands of a transcript run in one temporary
 directory, without a daemon. A command that fails changes no file. To write the transcripts anew
-from their commands, run `pytest --approve tests/unit/cli/test_transcripts.py`, and then read
+from their commands, run `pytest --approve tests/unit/test_cli_transcripts.py`, and then read
 `git diff`.
 """
 
@@ -29,7 +29,7 @@ from tests.scenarios.world import World
 from tests.system.typed import typed
 from tests.unit.calibration.logs import usual
 
-PLACE = Path(__file__).with_name("transcripts")
+PLACE = Path(__file__).with_name("words") / "transcripts"
 
 ADDRESS = "192.0.2.7"
 """The only address of this machine that a certificate names."""

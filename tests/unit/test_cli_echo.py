@@ -1,4 +1,4 @@
-"""Tests that print a payload of any encoding as one line of JSON."""
+"""`echo` prints a payload of any encoding as one line, each robot's share, and rates."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Tests of `acsard web`: its errors when no browser could connect, and its tokens."""
+"""`acsard web` makes and lists tokens."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Tests of the service's files and installation steps, and of where acsard may be installed."""
+"""The service's files and the steps of its installation."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 
+from acsard.cli import main
 from acsard.host.errors import MendableError
 from acsard.machine import service_installation, versions
 from acsard.machine.deploy_files import source
@@ -38,6 +39,7 @@ from acsard.machine.service_installation import (
     missing_prerequisite,
     uninstalling,
 )
+from tests.each import each
 
 
 def test_a_missing_group_or_program_of_the_units_is_reported_with_a_remedy() -> None:
@@ -246,3 +248,18 @@ def test_an_unreadable_file_is_reported_in_a_sentence(tmp_path: Path) -> None:
     assert place.condition() == "unreadable"
     with pytest.raises(MendableError, match=r"cannot read .*acsard\.toml"):
         place.current_content()
+
+
+@each("action", ["install", "uninstall"])
+def test_the_service_of_the_debian_package_is_left_to_apt(
+    action: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    (tmp_path / versions.PACKAGE).mkdir(exist_ok=True)
+    monkeypatch.setattr(versions, "HOME", tmp_path)
+    assert main(["service", action, "--dry-run"]) == 1
+    shown = capsys.readouterr()
+    assert "`sudo apt remove acsard` removes it" in shown.err
+    assert shown.out == ""

@@ -1,4 +1,4 @@
-"""Tests of `acsard recording`: the list, and the parts of the recordings that each verb takes."""
+"""`acsard recording`: the list, and the parts of the recordings that each verb takes."""
 
 from __future__ import annotations
 
@@ -218,7 +218,7 @@ def test_no_verb_raises_on_truncated_or_damaged_recordings(tmp_path: Path) -> No
 
 
 def test_the_default_directory_is_that_of_the_service() -> None:
-    unit = Path(__file__).parents[3] / "deploy/systemd/acsard.service"
+    unit = Path(__file__).parents[2] / "deploy/systemd/acsard.service"
     settings = dict(row.partition("=")[::2] for row in unit.read_text().splitlines() if "=" in row)
     state = Path("/var/lib") / settings["StateDirectory"]
     assert settings["Environment"] == f"ACSARD_RECORD=%S/{settings['StateDirectory']}/record"

@@ -1,4 +1,4 @@
-"""Tests of `acsard calibrate` on files, inside this process."""
+"""`acsard calibrate` on files, inside this process."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Tests of the times that a person types for --from and --to."""
+"""The times that a person types for --from and --to."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Tests of `acsard mcu check` on the built-in simulator, inside this process."""
+"""`acsard mcu check` on the built-in simulator, inside this process."""
 
 from __future__ import annotations
 

@@ -1,0 +1,245 @@
+"""The command line: exit codes, options, a cold start, and why a tool waits."""
+
+from __future__ import annotations
+
+import argparse
+import subprocess
+import sys
+from contextlib import nullcontext
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from acsard.cli import connection, foxglove, main, move, parser
+from acsard.cli.connection import Silence
+from acsard.cli.move import _parsed
+from acsard.client.follower import FIRST_STATE_TIMEOUT_S
+from acsard.core.values import Pose
+from acsard.host import errors
+from acsard.host.errors import (
+    EXIT_TEXTS,
+    Exit,
+    ExitError,
+    MendableError,
+    UsageError,
+)
+from tests.each import each
+
+PROMISED = [
+    (errors.UsageError, ValueError, 2),
+    (errors.ReplyError, RuntimeError, 1),
+    (errors.NotDrivenError, RuntimeError, 1),
+    (errors.RecordingError, ValueError, 1),
+    (errors.NoPortError, FileNotFoundError, 66),
+    (errors.UnreachableError, ConnectionError, 69),
+    (errors.NoAnswerError, TimeoutError, 69),
+    (errors.InUseError, OSError, 75),
+    (errors.NotPermittedError, PermissionError, 77),
+    (errors.CertificateError, ValueError, 78),
+    (errors.RouterFileError, ValueError, 78),
+]
+"""Error class, built-in base class and exit code, as section 6 of DESIGN lists them."""
+
+
+@each(("kind", "builtin", "code"), PROMISED)
+def test_each_error_has_a_builtin_base_class_and_an_exit_code(
+    kind: type[MendableError], builtin: type[Exception], code: int
+) -> None:
+    error = kind("it is so; mend it")
+    assert isinstance(error, builtin)
+    assert error.code == code
+    assert str(error) == "it is so; mend it"
+
+
+def test_every_error_class_has_an_exit_code() -> None:
+    kinds = {kind for kind in vars(errors).values() if isinstance(kind, type)}
+    families = {kind for kind in kinds if issubclass(kind, MendableError)} - {
+        MendableError,
+        ExitError,
+    }
+    assert families == {kind for kind, _, _ in PROMISED}
+
+
+def test_the_help_names_every_code(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        main(["--help"])
+    output = capsys.readouterr().out
+    assert all(f" {int(code)} " in output for code in Exit)
+    assert all(f"{code} {words}" in " ".join(output.split()) for code, words in EXIT_TEXTS.items())
+    assert set(EXIT_TEXTS) == set(Exit)
+
+
+@each("code", list(Exit))
+def test_a_verb_may_end_with_any_code(code: Exit) -> None:
+    assert ExitError(code, "so").code is code
+
+
+@each(
+    ("between", "behind"),
+    [
+        ("recording export 1 --csv cal.csv", "recording export 1 cal.csv --csv"),
+        ("recording report 1 --force x.html", "recording report 1 x.html --force"),
+        ("call set_pose --json 1 -2 3", "call set_pose 1 -2 3 --json"),
+        ("call set_pose 1 --id r1 -2 --json 3", "call set_pose 1 -2 3 --id r1 --json"),
+        ("set limits.linear_speed --json 0.8", "set limits.linear_speed 0.8 --json"),
+        (
+            "set rates.telemetry 5 --id r1 log.level info",
+            "set rates.telemetry 5 log.level info --id r1",
+        ),
+    ],
+)
+def test_an_option_may_stand_between_two_arguments(between: str, behind: str) -> None:
+    known = parser(between.split()[:1])
+    assert known.parse_args(between.split()) == known.parse_args(behind.split())
+
+
+@each("word", ["\udcff", "x" * 4097])
+def test_an_argument_that_no_message_could_contain_is_refused(
+    word: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["get", word]) == Exit.USAGE
+    text = capsys.readouterr().err
+    assert ("not valid UTF-8" in text) == (len(word) == 1)
+    assert ("longer than 4096 characters" in text) == (len(word) > 1)
+
+
+@each("name", ["STATE_DIRECTORY", "XDG_STATE_HOME", "HOME", "ACSARD_CONFIG"])
+def test_a_path_in_the_environment_that_is_not_utf_8_is_refused(
+    name: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setenv(name, "/var/lib/\udce4")
+        assert main(["--config", "/missing"]) == Exit.USAGE
+    assert f"the environment variable {name} is not valid UTF-8" in capsys.readouterr().err
+
+
+def test_a_current_directory_that_is_not_utf_8_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    where = tmp_path / "\udce4"
+    where.mkdir()
+    monkeypatch.chdir(where)
+    with pytest.raises(SystemExit) as end:
+        main(["call", "--help"])
+    assert end.value.code == 0
+    capsys.readouterr()
+    assert main(["--config", "/missing"]) == Exit.USAGE
+    assert "the path of the current directory is not valid UTF-8" in capsys.readouterr().err
+
+
+# Each takes 1 to 20 ms of processor time to load.
+SLOW = {
+    "acsard.bus.access", "acsard.core.incoming.queries", "acsard.core.messages.json_schema",
+    "asyncio", "concurrent.futures", "cryptography", "difflib", "hashlib", "logging", "numpy",
+    "rich", "socket", "ssl", "structlog", "subprocess", "tempfile", "tomllib",
+}  # fmt: skip
+
+
+def test_call_loads_no_slow_library() -> None:
+    code = "import sys; from acsard.cli import parser; parser(['call']); print(*sys.modules)"
+    done = subprocess.run(
+        [sys.executable, "-I", "-c", code], capture_output=True, text=True, check=True, timeout=60
+    )
+    assert SLOW & set(done.stdout.split()) == set()
+
+
+def test_a_number_of_the_range_is_taken() -> None:
+    drive = parser(["drive"]).parse_args(["drive", "--linear", "10", "--angular", "0"])
+    assert (drive.linear, drive.angular) == (10.0, 0.0)
+    assert parser(["echo"]).parse_args(["echo", "odom", "--timeout", "0.01"]).timeout == 0.01
+
+
+@pytest.fixture(name="reasons")
+def _reasons(monkeypatch: pytest.MonkeyPatch) -> dict[str, str]:
+    """Return the reasons that a look finds for a first and for a later silence."""
+    reasons = {"first": "waiting for\x1b[2J acsard/ghost/state", "later": "the way to it is cut"}
+    monkeypatch.setattr(connection, "_none_yet", lambda *_: reasons["first"])
+    monkeypatch.setattr(connection, "_ceased", lambda _: reasons["later"])
+    return reasons
+
+
+ROBOT: Any = SimpleNamespace()
+
+
+def test_each_silence_is_explained_once(
+    reasons: dict[str, str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    silence = Silence(ROBOT, "state")
+    silence.look(0.9 * FIRST_STATE_TIMEOUT_S)
+    assert capsys.readouterr().err == ""
+    for quiet_s in range(2, 20):
+        silence.look(quiet_s)
+    told = capsys.readouterr().err
+    assert told.startswith("acsard: waiting for")
+    assert (told.count("\n"), told.strip().isprintable()) == (1, True)
+    for _ in range(2):
+        silence.heard()
+        for quiet_s in range(20):
+            silence.look(quiet_s)
+        assert capsys.readouterr().err == "acsard: the way to it is cut\n"
+
+
+def test_a_silence_without_a_found_cause_is_looked_at_again(
+    reasons: dict[str, str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    silence = Silence(ROBOT, "")
+    reasons["later"] = ""
+    silence.look(FIRST_STATE_TIMEOUT_S)
+    reasons["later"] = "its certificate has ended"
+    silence.look(1.9 * FIRST_STATE_TIMEOUT_S)
+    assert capsys.readouterr().err == ""
+    silence.look(2 * FIRST_STATE_TIMEOUT_S)
+    silence.explain()  # the timeout ends it
+    assert capsys.readouterr().err == "acsard: its certificate has ended\n"
+
+
+def test_ways_are_metres_and_degrees_in_their_directions() -> None:
+    words = ["forward", "1", "left", "90", "back", "0.5", "right", "45"]
+    assert _parsed(words) == [(False, 1.0), (True, 90.0), (False, -0.5), (True, -45.0)]
+
+
+@each("words", ["up 1", "forward", "forward x", "forward -1", "left nan", "1 forward", "left 1 up"])
+def test_other_words_are_refused_with_an_example(words: str) -> None:
+    with pytest.raises(UsageError, match="acsard move forward 1 left 90"):
+        _parsed(words.split())
+
+
+def test_an_interrupted_drive_prints_how_far_it_came(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def driven(_: float, *, speed: float) -> None:
+        raise KeyboardInterrupt
+
+    robot = SimpleNamespace(move=driven, pose=lambda: Pose(0.53, 0.0, 0.0))
+    monkeypatch.setattr(move, "connected", lambda *_: nullcontext())
+    monkeypatch.setattr(move, "Client", lambda _: robot)
+    assert main(["move", "forward", "1"]) == 130
+    assert "+0.530 m" in capsys.readouterr().out
+
+
+def test_without_its_library_it_says_which_extra_to_install(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    for name in [name for name in sys.modules if name.startswith("acsard.foxglove")]:
+        monkeypatch.delitem(sys.modules, name)
+    monkeypatch.setitem(sys.modules, "foxglove", None)  # as if the library were not installed
+    with pytest.raises(MendableError, match=r"pipx? install .*\[foxglove(,tools)?\]'") as error:
+        foxglove.main(argparse.Namespace())
+    assert error.value.code == Exit.FAILURE
+
+
+# the address: viewers may connect only from this machine
+
+
+@pytest.mark.parametrize(
+    ("text", "address"),
+    [
+        (foxglove.DEFAULT_ADDRESS, ("127.0.0.1", 8765)),
+        ("localhost:9000", ("127.0.0.1", 9000)),
+        ("127.1.2.3:1", ("127.1.2.3", 1)),
+    ],
+)
+def test_an_address_of_this_machine_is_taken(text: str, address: tuple[str, int]) -> None:
+    assert foxglove.loopback(text) == address

@@ -1,0 +1,255 @@
+"""The doctor: the daemon's reports, the file, this computer, and its ports."""
+
+from __future__ import annotations
+
+import os
+import pty
+import re
+import resource
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from msgspec.structs import replace
+
+from acsard.bus.address import Address
+from acsard.bus.zenoh_sessions import answers
+from acsard.cli import main
+from acsard.core.config.parsing import parse
+from acsard.core.config.settings import BusConfig, Config, McuConfig
+from acsard.core.messages.encodings import DecodeError
+from acsard.core.messages.schema import DiagnosticStatus, Info, KeyValue
+from acsard.host import real_time
+from acsard.host.errors import CertificateError, NoAnswerError, UsageError
+from acsard.host.kernel_counters import Kernel
+from acsard.machine import doctor, versions
+from acsard.machine.doctor import Running, clocks, compared, reported
+from acsard.machine.finding import Finding
+from acsard.machine.local_findings import scheduling, serial_port, slowness, unused_version
+from acsard.machine.serial_ports import BOARDS
+from tests.unit.host.kernel_files import HWMON, POLICY, QUIET, write
+
+INFO = Info("acsar", "1.2", 77, "/dev/pts/3", False, 100.0, [], [])
+FILE = Config()
+
+
+def running(config: Config = FILE, **more: float) -> Running:
+    return Running(INFO, config, (), "", **more)  # type: ignore[arg-type]
+
+
+def row(name: str, level: int, message: str, advice: str = "", code: str = "") -> DiagnosticStatus:
+    pairs = {"a": "b", "advice": advice, "code": code}
+    values = [KeyValue(key, value) for key, value in pairs.items() if value]
+    return DiagnosticStatus(level, f"acsard: {name}", message, "acsar", values)
+
+
+def test_each_report_of_the_daemon_is_a_finding_with_its_advice() -> None:
+    rows = (row("mode", 0, "ready"), row("wheels", 1, "blocked", "look"), row("gyro", 3, "old"))
+    assert list(reported(rows)) == [
+        Finding("mode", "ok", "ready"),
+        Finding("wheels", "warning", "blocked", "look"),
+        Finding("gyro", "failure", "old"),
+    ]
+
+
+def test_a_reason_of_two_reports_is_printed_once_where_it_is_not_ok() -> None:
+    waits = row("mode", 0, "nothing came", code="silent")
+    link = row("serial link", 2, "down: nothing came", "check", code="silent")
+    assert list(reported((waits, link, row("recording", 0, "on")))) == [
+        Finding("serial link", "failure", "down: nothing came", "check"),
+        Finding("recording", "ok", "on"),
+    ]
+
+
+def test_the_file_s_values_are_ok() -> None:
+    assert [finding.level for finding in compared(running(), FILE)] == ["ok"]
+
+
+def test_values_of_command_line_options_are_offered_as_lines_for_the_file() -> None:
+    bus = BusConfig(listen=("tcp/127.0.0.1:1", "tcp/127.0.0.1:2"))
+    runs = replace(FILE, mcu=McuConfig(port="/dev/pts/3"), bus=bus)
+    (finding,) = compared(running(runs), FILE)
+    assert finding.level == "ok"
+    keep = finding.mend.partition("into the file: ")[2]
+    assert parse("\n".join(re.split(r"; |(?<=]) (?=\w)", keep)).encode()) == runs
+
+
+def test_values_that_were_set_and_sources_that_only_the_file_has_are_a_warning() -> None:
+    limits = replace(FILE.limits, linear_speed=0.4)
+    commands = replace(FILE.commands, sources=FILE.commands.sources[1:])
+    (finding,) = compared(running(replace(FILE, limits=limits, commands=commands)), FILE)
+    assert finding.level == "warning"
+    assert "limits.linear_speed = 0.4, not " in finding.text
+    assert f"commands.sources.{FILE.commands.sources[0].name}.priority" in finding.text
+    assert "acsard set KEY VALUE --keep" in finding.mend
+
+
+@pytest.mark.parametrize(
+    ("ahead_s", "trip_s", "words"),
+    [(0.3, 0.0, ""), (-0.8, 1.0, ""), (-2.0, 1.0, "2.0 s behind"), (3600.0, 0.0, "s ahead of")],
+)
+def test_a_clock_is_wrong_if_a_late_answer_does_not_explain_it(
+    ahead_s: float, trip_s: float, words: str
+) -> None:
+    findings = list(clocks(running(ahead_s=ahead_s, round_trip_s=trip_s)))
+    assert [finding.level for finding in findings] == ["warning"] * bool(words)
+    assert all(words in finding.text for finding in findings)
+
+
+@pytest.mark.parametrize(
+    ("error", "mend"),
+    [
+        (NoAnswerError("no answer"), "check whether another program listens at that address"),
+        (CertificateError("there is no directory certs: run `acsard tls init`"), ""),
+        (DecodeError("wrong_shape", "a field is missing"), "from the same version"),
+    ],
+)
+def test_a_failed_query_of_the_daemon_has_advice_that_fits_its_error(
+    error: Exception, mend: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(*_: object) -> None:
+        raise error
+
+    monkeypatch.setattr(doctor, "answers", lambda _: True)
+    monkeypatch.setattr(doctor, "query", fail)
+    finding = doctor.query_or_finding(FILE, Address("tcp/127.0.0.1:7448", "acsar", ""))
+    assert isinstance(finding, Finding)
+    assert (finding.level, finding.text) == ("failure", str(error))
+    assert finding.mend.endswith(mend) if mend else not finding.mend
+
+
+@pytest.mark.parametrize("host", ["a..b", "a" * 70])
+def test_a_host_that_cannot_exist_is_no_endpoint(host: str) -> None:
+    with pytest.raises(UsageError, match="endpoint"):
+        answers(f"tcp/{host}:7448")
+
+
+def test_control_characters_of_a_robot_do_not_reach_the_terminal(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    finding = Finding("daemon", "ok", "ready: \x1b]0;owned\x07\nFAIL", "type\x1b[2J\n  a = 1")
+    monkeypatch.setattr("acsard.cli.doctor.examine", lambda *_: [finding])
+    assert main(["doctor"]) == 0
+    text = capsys.readouterr().out
+    assert (
+        text == "ok    daemon: ready: \ufffd]0;owned\ufffd FAIL\n      -> type\ufffd[2J\n  a = 1\n"
+    )
+
+
+WANTED = True
+
+
+@pytest.mark.parametrize(
+    ("capable", "limit", "level"),
+    [(False, 0, "warning"), (False, 9, "warning"), (False, 10, "ok"), (False, -1, "ok"),
+     (True, 0, "ok")],
+)  # fmt: skip
+def test_root_without_the_capability_needs_a_real_time_limit(
+    capable: bool, limit: int, level: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(os, "geteuid", lambda: 0)
+    monkeypatch.setattr(resource, "getrlimit", lambda _: (limit, limit))
+    monkeypatch.setattr(real_time, "_capable", lambda _: capable)
+    (finding,) = scheduling(WANTED, None)
+    assert finding.level == level
+    assert bool(finding.mend) == (level == "warning")
+
+
+@pytest.mark.parametrize(
+    ("policy", "level"),
+    [(os.SCHED_OTHER, "warning"), (os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, "ok")],
+)
+def test_the_scheduling_policy_of_a_running_daemon_is_reported(
+    policy: int, level: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(os, "sched_getscheduler", lambda _: policy)
+    (finding,) = scheduling(WANTED, 77)
+    assert (finding.level, "pid 77" in finding.text) == (level, True)
+
+
+# A person's own simulator of their board often keeps both ends of its pty open.
+OWN_BOARD = """
+import os, pty, sys
+board, port = pty.openpty()
+print(os.ttyname(port), flush=True)
+sys.stdin.read()
+"""
+
+
+def test_the_simulator_of_a_person_s_own_board_is_not_to_be_killed() -> None:
+    with subprocess.Popen(
+        [sys.executable, "-c", OWN_BOARD], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    ) as board:
+        assert board.stdout is not None
+        findings = list(serial_port(board.stdout.readline().strip(), simulated=False))
+        assert board.stdin is not None
+        board.stdin.close()
+    (used,) = [finding for finding in findings if f"(pid {board.pid})" in finding.text]
+    assert (used.level, used.mend) == ("ok", "")
+    assert "simulates the board" in used.text
+
+
+def test_a_program_that_uses_the_port_in_place_of_the_daemon_is_a_failure() -> None:
+    board, port = pty.openpty()
+    path = os.ttyname(port)
+    opened = f"os.open({path!r}, os.O_RDWR | os.O_NOCTTY)"
+    code = f"import os, sys; {opened}; print(flush=True); sys.stdin.read()"
+    with subprocess.Popen(
+        [sys.executable, "-c", code], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    ) as other:
+        assert other.stdout is not None
+        other.stdout.readline()
+        findings = list(serial_port(path, simulated=False))
+        assert other.stdin is not None
+        other.stdin.close()
+    for end in (board, port):
+        os.close(end)
+    (used,) = [finding for finding in findings if f"(pid {other.pid})" in finding.text]
+    assert (used.level, f"kill {other.pid}" in used.mend) == ("failure", True)
+
+
+def test_without_real_time_in_the_configuration_no_warning_is_given() -> None:
+    (finding,) = scheduling(False, 77)
+    assert finding.level == "ok"
+
+
+def test_a_computer_without_causes_of_lateness_is_ok(tmp_path: Path) -> None:
+    (finding,) = slowness(Kernel(write(tmp_path, QUIET)))
+    assert (finding.subject, finding.level) == ("computer", "ok")
+
+
+def test_each_present_cause_of_lateness_is_a_warning_with_a_remedy(tmp_path: Path) -> None:
+    files = {HWMON + "in0_lcrit_alarm": "1\n", POLICY + "scaling_governor": "powersave\n"}
+    findings = list(slowness(Kernel(write(tmp_path, QUIET | files))))
+    assert [finding.level for finding in findings] == ["warning", "warning"]
+    assert "supply voltage is too low" in findings[0].text
+    assert "power supply" in findings[0].mend
+    assert "powersave keeps the processor at 600 of 1500 MHz" in findings[1].text
+    assert "schedutil" in findings[1].mend
+
+
+def test_a_newer_version_that_is_not_in_use_is_a_warning_with_the_command(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    assert list(unused_version()) == []
+    monkeypatch.setattr(versions, "unused", lambda: "0.3.0")
+    (finding,) = unused_version()
+    assert finding.level == "warning"
+    assert "`sudo acsard service upgrade /opt/acsard/0.3.0`" in finding.mend
+
+
+RULES = Path(__file__).parents[2] / "deploy" / "udev" / "70-acsar.rules"
+
+LINE = 'ENV{ID_VENDOR_ID}=="%s", ENV{ID_MODEL_ID}=="%s", ENV{ACSAR_MCU}="1"'
+
+
+def test_the_udev_rules_name_exactly_the_usual_boards() -> None:
+    lines = re.findall(re.escape(LINE).replace("%s", r"([\w|]+)"), RULES.read_text())
+    named = [f"{vendor}:{model}" for vendor, models in lines for model in models.split("|")]
+    assert sorted(named) == sorted(BOARDS)
+
+
+def test_no_other_line_of_the_rules_chooses_a_board() -> None:
+    chosen = [row for row in RULES.read_text().splitlines() if 'ENV{ACSAR_MCU}="1"' in row]
+    assert all(re.fullmatch(re.escape(LINE).replace("%s", r"[\w|]+"), row) for row in chosen)
