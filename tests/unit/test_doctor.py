@@ -28,7 +28,7 @@ from acsard.machine.doctor import Running, clocks, compared, reported
 from acsard.machine.finding import Finding
 from acsard.machine.local_findings import scheduling, serial_port, slowness, unused_version
 from acsard.machine.serial_ports import BOARDS
-from tests.unit.host.kernel_files import HWMON, POLICY, QUIET, write
+from tests.unit.kernel_files import HWMON, POLICY, QUIET, write
 
 INFO = Info("acsar", "1.2", 77, "/dev/pts/3", False, 100.0, [], [])
 FILE = Config()

@@ -37,8 +37,8 @@ from acsard.web.followed_robot import (
 from acsard.web.metrics import Counts
 from acsard.web.streams import Stream, Streams
 from tests.system.harness import until
-from tests.unit.client.test_follower import UNREADABLE, Robot
 from tests.unit.screens import INFO, STATE, sample_of
+from tests.unit.test_client_follower import UNREADABLE, Robot
 
 ABOUT = About("1", False, 1.0, 4.0, 10.0, "", {"teleop": 0.25, "app": 0.25})
 

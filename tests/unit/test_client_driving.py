@@ -1,4 +1,4 @@
-"""Tests of the client's `drive` in virtual time. It watches the `state` and ends by it."""
+"""The client's `drive` in virtual time. It watches the `state` and ends by it."""
 
 from __future__ import annotations
 
@@ -29,8 +29,8 @@ from acsard.core.values import NS_PER_S
 from acsard.host import clock
 from acsard.host.errors import NoAnswerError, NotDrivenError, UsageError
 from tests.each import each
-from tests.unit.client.test_course import Robot as StandingRobot
 from tests.unit.screens import raw_sample, sample_of
+from tests.unit.test_client_course import Robot as StandingRobot
 
 US, OTHER = "joe/1/aa", "ann/2/bb"
 NEUTRAL = "send a zero first: app must send a zero"

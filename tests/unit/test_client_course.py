@@ -1,4 +1,4 @@
-"""Courses by `odom`, with a robot that follows each command after a delay."""
+"""Ways by the odometry."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Tests of the log: its formats, its queue, and the journal's protocol on a real socket."""
+"""The log: its formats, its queue, and the journal's protocol on a real socket."""
 
 from __future__ import annotations
 

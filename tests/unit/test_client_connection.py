@@ -1,4 +1,4 @@
-"""Tests of a connection and its clients without a bus: sent commands, calls and errors."""
+"""A connection and its clients without a bus: sent commands, calls and errors."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""Tests of the token bucket and of limited places.
-
-A bucket allows a burst and then its rate. Places are limited for each name and in total.
-"""
+"""Reports that a fault repeats are bounded, and each loses its turn to none."""
 
 from __future__ import annotations
 

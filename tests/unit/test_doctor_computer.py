@@ -1,4 +1,4 @@
-"""The daemon parses the kernel's files into values. A missing file counts as zeros."""
+"""What the kernel says about this computer."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from acsard.host.kernel_counters import Conditions, Kernel, Reading, SlowClock, slow_clock
-from tests.unit.host.kernel_files import COOLER, COUNT, FIRMWARE, HWMON, POLICY, QUIET, write
+from tests.unit.kernel_files import COOLER, COUNT, FIRMWARE, HWMON, POLICY, QUIET, write
 
 TICK = 10_000_000
 

@@ -1,4 +1,4 @@
-"""Tests of a follower: the newest state of a robot, its age, and the proof that the daemon runs."""
+"""Whether a robot is there, silent or gone."""
 
 from __future__ import annotations
 
