@@ -61,8 +61,8 @@ VARIATIONS_PER_CI_TEST = 10
 
 LOUD = (
     "test_bad_commands.py", "test_board.py", "test_bus.py", "test_daemon.py", "test_faults.py",
-    "test_faults_bus.py", "test_isolation.py", "test_page_lets_go.py", "test_period.py",
-    "test_record_disks.py", "test_strangers.py", "test_web_attacks.py", "test_web_lets_go.py",
+    "test_faults_bus.py", "test_isolation.py", "test_page_attacks.py", "test_page_lets_go.py",
+    "test_page_program_lets_go.py", "test_period.py", "test_record_disks.py", "test_strangers.py",
 )  # fmt: skip
 """Live modules that load the machine, or that count missed periods.
 
