@@ -60,8 +60,8 @@ VARIATIONS_PER_CI_TEST = 10
 """`.ci/run` runs about one in this many slow variations. The nightly job runs the others."""
 
 LOUD = (
-    "test_bad_commands.py", "test_board.py", "test_bus.py", "test_daemon.py", "test_faults.py",
-    "test_faults_bus.py", "test_isolation.py", "test_page_attacks.py", "test_page_lets_go.py",
+    "test_board.py", "test_bus.py", "test_daemon.py", "test_faults.py", "test_faults_bus.py",
+    "test_inputs.py", "test_isolation.py", "test_page_attacks.py", "test_page_lets_go.py",
     "test_page_program_lets_go.py", "test_period.py", "test_record_disks.py", "test_strangers.py",
 )  # fmt: skip
 """Live modules that load the machine, or that count missed periods.

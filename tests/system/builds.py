@@ -14,6 +14,9 @@ from tests.system.harness import ROOT, environment
 BUILD_S = 3600
 """Time limit of a test that may have to build a bridge first."""
 
+CLIENTS = ROOT / "deploy/clients"
+"""The examples in other languages."""
+
 LIBCLANG = "no libclang: it builds the bridge's bindings (Debian: apt install libclang-dev)"
 
 
@@ -53,3 +56,16 @@ def ros2dds_bridge(cache: Path) -> str:
         pytest.skip(LIBCLANG)
     assert done.returncode == 0, done.stderr
     return str(target / "debug/ros2dds")
+
+
+def copied(language: str, cache: Path) -> Path:
+    """Copy the example of a language into the build directory, which keeps earlier builds."""
+    built = shutil.ignore_patterns("target", "node_modules", "dist", "*lock*")
+    return shutil.copytree(CLIENTS / language, cache / language, ignore=built, dirs_exist_ok=True)
+
+
+def node_program(where: Path) -> list[str]:
+    """Return the words that run the program for Node."""
+    node = program("node", "it runs the program")
+    flags = ["--experimental-websocket"] if run([node, "--version"], where) < "v22" else []
+    return [node, *flags, str(CLIENTS / "node/drive.mjs")]

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import json
+import tomllib
 from pathlib import Path
+from typing import Any
 
 import zenoh
 
 from acsard.machine.authority import Authority
 from acsard.machine.router_file import router_file
-from tests.system.harness import ROOT, Program, acsard
+from tests.system.harness import ROOT, Daemon, Program, acsard
 from tests.system.strangers import command_line
 
 FILES = ROOT / "deploy" / "zenoh"
@@ -98,6 +100,18 @@ def write_local_copy(file: Path, where: Path, endpoint: str) -> Path:
     changed = file.with_suffix(".json")
     changed.write_text(str(config))
     return changed
+
+
+def robot_at(endpoint: str, where: Path, robot_id: str, mode: str = "client", **how: Any) -> Daemon:
+    """Return a daemon with robot.toml and the certificate of its id. `how` goes to `Daemon`.
+
+    As a Zenoh peer it also serves the programs on its own machine, as README.md describes.
+    """
+    tables = tomllib.loads(ROBOT_FILE.read_text())
+    tables["robot"]["id"] = robot_id
+    tables["bus"] |= {"connect": [endpoint], "tls": str(where / robot_id), "mode": mode}
+    tables["sim"] = {"faults": ["battery=80:600"]}
+    return Daemon(where, config=tables, **{"name": robot_id} | how)
 
 
 def router(where: Path, endpoint: str) -> Program:

@@ -27,10 +27,8 @@ from tests.system.harness import (
     Program,
     Tables,
     alive_at,
-    client_config,
     kept_waiting,
     seconds,
-    twist,
     until,
 )
 from tests.system.strangers import DELETES, command_line
@@ -119,14 +117,6 @@ def test_a_get_on_a_published_key_answers_with_its_last_value(shared: Daemon, fo
             assert set(getattr(msgspec, form).decode(answer.payload)) == FIELDS[key]
 
 
-def test_the_last_value_of_odometry_is_current(bus: Bus) -> None:
-    stamps = [seconds(bus.get("odom")["header"]["stamp"]) for _ in range(2)]
-    assert abs(time.time() - stamps[0]) < 0.5
-    until(
-        lambda: seconds(bus.get("odom")["header"]["stamp"]) > stamps[1], 2.0, "a newer last value"
-    )
-
-
 # the daemon's information about itself
 
 
@@ -187,18 +177,6 @@ def test_a_get_by_wildcard_never_runs_a_service(bus: Bus, latched: bool) -> None
 # services
 
 
-def test_stop_and_clear_by_their_exact_keys(bus: Bus) -> None:
-    with restored(bus):
-        assert bus.get("srv/stop")["success"]
-        assert bus.state()["mode"] == "stopped"
-        assert bus.state()["code"] == "stopped"
-        refused = bus.get("srv/activate")
-        assert (refused["success"], "clear" in refused["message"]) == (False, True)
-        assert bus.get("srv/clear")["success"]
-        bus.comes_to("ready")
-        assert bus.get("srv/clear")["success"]
-
-
 def test_deactivate_and_activate_by_their_exact_keys(bus: Bus) -> None:
     with restored(bus):
         assert bus.get("srv/deactivate")["success"]
@@ -207,14 +185,6 @@ def test_deactivate_and_activate_by_their_exact_keys(bus: Bus) -> None:
         assert bus.get("srv/activate")["success"]
         # While the link is up the state is never "waiting", which means that there is no link.
         bus.comes_to("ready")
-
-
-def test_a_service_answers_on_its_ros_key_too(bus: Bus) -> None:
-    with restored(bus):
-        (reply,) = bus.session.get("acsard/deactivate", payload=b"\0\1\0\0\0", timeout=5.0)
-        assert reply.ok is not None
-        assert reply.ok.payload.to_bytes()[4] == 1  # CDR of `success`
-        assert bus.state()["mode"] == "inactive"
 
 
 def test_set_pose_and_reset_odometry_move_the_pose_of_every_key(bus: Bus) -> None:
@@ -263,19 +233,6 @@ def test_a_put_that_reaches_the_stop_key_latches(bus: Bus, key: str, payload: by
             until(lambda: bus.count("lines_sent") > waited + 30, 5.0, "30 lines")
             assert bus.state()["mode"] == "stopped"
         assert bus.state()["x"] == pytest.approx(x, abs=0.01)
-
-
-def test_a_delete_on_stop_is_counted_as_not_a_put_and_latches_nothing(bus: Bus) -> None:
-    refused, before = bus.count("command_not_a_put"), bus.count("commands")
-    bus.session.delete("acsard/acsar/stop")
-    # A command that follows on the same link has been accepted when it is counted.
-    bus.put("cmd/app", twist(0.0))
-    until(lambda: bus.count("commands") > before, 5.0, "the command behind it")
-    state = bus.state()
-    assert state["counters"]["command_not_a_put"] == refused + 1
-    assert state["refused"] == "stop: send a PUT, not a DELETE"
-    assert state["mode"] != "stopped"
-    bus.at_rest()
 
 
 @pytest.mark.slow
@@ -508,16 +465,6 @@ def test_a_stop_query_after_more_queries_than_the_limit_stops_the_robot(
     print(f"{unanswered} of 3 stops came with 512 queries open; all of them stopped")
 
 
-def test_two_clients_receive_the_same_odometry(bus: Bus, shared: Daemon) -> None:
-    with zenoh.open(client_config(shared.endpoint)) as other, bus.follow("odom") as mine:
-        theirs = Following()
-        subscriber = other.declare_subscriber("acsard/*/odom", theirs.add)
-        until(lambda: theirs.seen, 3.0, "odometry at the other client")
-        stamp = theirs.seen[0].value["header"]["stamp"]
-        mine.find(lambda value: value["header"]["stamp"] == stamp, 3.0, "the same sample here")
-        subscriber.undeclare()
-
-
 # at the end: the message for which `late` has waited all along
 
 
@@ -527,8 +474,3 @@ def test_a_late_plain_subscriber_gets_tf_static_within_6_s(late: Late) -> None:
     assert entry.at - late.since < 6.0
     assert entry.encoding == "application/msgpack;acsard.TFMessage.v1"
     assert entry.value["transforms"][0]["child_frame_id"] == "lidar_link"
-
-
-def test_no_request_of_this_module_raised_an_exception_in_the_daemon(shared: Daemon) -> None:
-    assert "Traceback" not in shared.stderr
-    assert shared.process.poll() is None

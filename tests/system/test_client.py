@@ -1,4 +1,4 @@
-"""`acsard.client` and the README's examples, against a running daemon."""
+"""`acsard.client` against a running daemon."""
 
 from __future__ import annotations
 
@@ -7,14 +7,13 @@ import json
 import math
 import re
 import signal
-import socket
 import sys
 import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import pytest
 import zenoh
@@ -38,153 +37,14 @@ from tests.system.harness import (
     ROOT,
     Bus,
     Daemon,
-    Finished,
-    Program,
     Tables,
     client_config,
     finish,
     free_endpoint,
-    kept_waiting,
-    silences,
     until,
 )
-from tests.system.strangers import command_line
 
 DEFAULT = "tcp/127.0.0.1:7448"
-
-
-# the README
-
-
-class Outcome(NamedTuple):
-    """An example's exit, the robot's final state, and the time lost to other programs, s."""
-
-    ended: Finished
-    state: Any
-    late: float
-
-
-def code_blocks() -> list[str]:
-    """Return the Python code blocks of the README."""
-    return re.findall(r"^```python\n(.*?)^```", (ROOT / "README.md").read_text(), re.S | re.M)
-
-
-def kind(code: str) -> str:
-    """Return the name of the example that has this code."""
-    if "connect_async" in code:
-        return "async"
-    return "first" if "acsard.client" in code else "plain zenoh"
-
-
-def default_is_free() -> bool:
-    """Return whether no program uses the daemon's default endpoint."""
-    with socket.socket() as probe:
-        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        try:
-            probe.bind(("127.0.0.1", 7448))
-        except OSError:
-            return False
-    return True
-
-
-def at_endpoint(code: str, endpoint: str) -> str:
-    """Return the example with this daemon's endpoint instead of the default one."""
-    if endpoint == DEFAULT:
-        return code
-    changed = re.sub(r"(connect|connect_async)\(\)", rf'\1("{endpoint}")', code)
-    return changed.replace(DEFAULT, endpoint)
-
-
-@pytest.fixture(scope="module")
-def examples(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Outcome]:
-    """Run all examples at the same time, each with its own robot, as each takes two seconds."""
-    where = tmp_path_factory.mktemp("examples")
-    codes = {kind(code): code for code in code_blocks()}
-    endpoints = {name: free_endpoint() for name in codes}
-    if default_is_free():
-        endpoints["first"] = DEFAULT
-    outcomes = {}
-    with ExitStack() as stack:
-        buses = {}
-        for number, (name, endpoint) in enumerate(endpoints.items()):
-            stack.enter_context(Daemon(where, endpoint=endpoint, name=f"daemon{number}"))
-            buses[name] = stack.enter_context(Bus(endpoint))
-        before = {}
-        for name, bus in buses.items():
-            bus.linked()
-            before[name] = kept_waiting(bus.get("info")["pid"])
-        samples = {name: stack.enter_context(bus.follow("cmd/app")) for name, bus in buses.items()}
-        running = {
-            name: stack.enter_context(
-                Program(command_line(at_endpoint(code, endpoints[name])), where)
-            )
-            for name, code in codes.items()
-        }
-        for name, program in running.items():
-            code = program.ended(20.0)
-            took = time.monotonic() - program.started
-            ended = Finished(code, program.stdout, program.stderr, took)
-            state = buses[name].at_rest()
-            print(
-                f"{name}: exit {code}, x {state['x']:.4f} y {state['y']:.4f} yaw {state['yaw']:.4f}"
-            )
-            waited_s = kept_waiting(buses[name].get("info")["pid"]) - before[name]
-            silent_s = silences([entry.at for entry in samples[name].seen])
-            late = lost(program.started) + waited_s + silent_s
-            outcomes[name] = Outcome(ended, state, late)
-    return outcomes
-
-
-def test_the_readme_has_the_three_examples() -> None:
-    assert sorted(map(kind, code_blocks())) == ["async", "first", "plain zenoh"]
-
-
-@pytest.mark.slow
-def test_the_first_example_of_the_readme_drives_one_metre_turns_and_prints_the_pose(
-    examples: dict[str, Outcome],
-) -> None:
-    ended, state, late = examples["first"]
-    assert (ended.code, ended.err) == (0, "")
-    assert ended.out.startswith("Pose(x=")
-    # If a message comes late, the robot drives on meanwhile, at 0.02 m/s near the end.
-    assert state["x"] == pytest.approx(1.0, abs=0.005 + 0.02 * late)
-    assert state["yaw"] == pytest.approx(math.radians(90.0), abs=math.radians(0.5 + 3.0 * late))
-    # The example prints where the robot came to a stand, not where it still rolled.
-    printed = re.match(r"Pose\(x=([\d.]+),", ended.out)
-    assert printed
-    assert float(printed[1]) == pytest.approx(state["x"], abs=0.01)
-    assert state["y"] == pytest.approx(0.0, abs=0.01)
-
-
-@pytest.mark.slow
-def test_the_async_example_of_the_readme_follows_the_robot_while_it_drives(
-    examples: dict[str, Outcome],
-) -> None:
-    ended, state, late = examples["async"]
-    assert (ended.code, ended.err) == (0, "")
-    assert len(ended.out.splitlines()) > 100
-    assert state["yaw"] == pytest.approx(0.4, abs=0.02 + 0.2 * late)
-    assert state["x"] == pytest.approx(0.97, abs=0.05 + 0.5 * late)
-
-
-@pytest.mark.slow
-def test_the_plain_zenoh_example_of_the_readme_drives_one_metre_and_follows_the_odometry(
-    examples: dict[str, Outcome],
-) -> None:
-    ended, state, late = examples["plain zenoh"]
-    assert (ended.code, ended.err) == (0, "")
-    odometry = [json.loads(line) for line in ended.out.splitlines()]
-    assert len(odometry) > 10
-    assert {odom["child_frame_id"] for odom in odometry} == {"base_link"}
-    first, last = (
-        message["pose"]["pose"]["position"]["x"] for message in (odometry[0], odometry[-1])
-    )
-    assert first < 0.5 * state["x"] < last
-    # The example's own sleeps add up to a little more than 2 s.
-    assert state["x"] == pytest.approx(1.03, abs=0.05 + 0.5 * late), state["counters"]
-
-
-# the client
 
 
 @pytest.fixture
@@ -212,21 +72,16 @@ def test_typed_messages_of_every_published_key(shared: Daemon, fresh: Bus) -> No
         assert isinstance(next(robot.messages("odom", timeout=2.0)), schema.Odometry)
 
 
-def test_get_config_gives_a_dictionary(shared: Daemon, fresh: Bus) -> None:
-    with connect(shared.endpoint) as robot:
-        assert robot.get("config") == fresh.get("config")
-        assert robot.get("info").pid == shared.pid
-
-
 def test_a_key_that_does_not_exist_raises_an_error_with_the_near_name(shared: Daemon) -> None:
-    wrong: Any = "odmo"
+    wrong: list[tuple[Any, str]] = [
+        ("odmo", r"'odmo' is not a key.*did you mean odom"), ("xyz//x", "acsard topics"),
+    ]  # fmt: skip
     with connect(shared.endpoint) as robot:
-        for read in (robot.get, robot.messages):
-            with pytest.raises(
-                UsageError, match=r"'odmo' is not a key.*did you mean odom"
-            ) as error:
-                read(wrong)
-            assert isinstance(error.value, ValueError)
+        for name, why in wrong:
+            for read in (robot.get, robot.messages):
+                with pytest.raises(UsageError, match=why) as error:
+                    read(name)
+                assert isinstance(error.value, ValueError)
         query: Any = "info"
         with pytest.raises(UsageError, match="nothing is published on the key info: use get"):
             robot.messages(query)
@@ -265,13 +120,15 @@ def test_connect_without_arguments_uses_the_file_that_the_environment_names(
         assert robot.get("info").pid == asyncio.run(pid()) == shared.pid
 
 
-def test_connecting_without_a_daemon_raises_a_connection_error_with_the_remedy() -> None:
+async def test_connecting_without_a_daemon_raises_a_connection_error_with_the_remedy() -> None:
     endpoint = free_endpoint()
-    with pytest.raises(UnreachableError) as error, connect(endpoint):
+    with pytest.raises(UnreachableError, match="acsard run") as error, connect(endpoint):
         pass
     assert isinstance(error.value, ConnectionError)
     assert endpoint in str(error.value)
-    assert "acsard run" in str(error.value)
+    with pytest.raises(UnreachableError):
+        async with connect_async(endpoint):
+            pass
 
 
 _ONLY_ITS_LIBRARIES = """\
@@ -314,21 +171,6 @@ def test_a_client_program_needs_no_library_but_zenoh_msgspec_and_xxhash(
     assert done.out.splitlines() == ["True up", "others:"]
 
 
-async def test_connecting_async_without_a_daemon_raises_the_same_error() -> None:
-    with pytest.raises(UnreachableError):
-        async with connect_async(free_endpoint()):
-            pass
-
-
-@pytest.mark.parametrize("robot_id", ["a/b*", "", "robot 1"])
-def test_an_invalid_robot_id_raises_a_usage_error(robot_id: str) -> None:
-    with (
-        pytest.raises(UsageError, match="is not a robot's id"),
-        connect(free_endpoint(), robot_id=robot_id),
-    ):
-        pass
-
-
 def test_a_call_that_is_not_answered_in_time_raises_no_answer(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -346,19 +188,17 @@ def test_a_call_that_is_not_answered_in_time_raises_no_answer(
         unanswered.clear()
 
 
-@pytest.mark.parametrize("endpoint", ["127.0.0.1:7448", "", "tcp/127.0.0.1", "tcp/[::1]"])
-def test_an_invalid_endpoint_raises_a_value_error(endpoint: str) -> None:
-    with pytest.raises(UsageError, match="write it like") as error, connect(endpoint):
+@pytest.mark.parametrize(
+    ("endpoint", "robot_id", "why"),
+    [
+        *((endpoint, "acsar", "write it like") for endpoint in ("127.0.0.1:7448", "", "tcp/[::1]")),
+        *((DEFAULT, robot_id, "is not a robot's id") for robot_id in ("a/b*", "")),
+    ],
+)
+def test_an_invalid_address_raises_a_value_error(endpoint: str, robot_id: str, why: str) -> None:
+    with pytest.raises(UsageError, match=why) as error, connect(endpoint, robot_id=robot_id):
         pass
     assert isinstance(error.value, ValueError)
-
-
-def test_an_invalid_key_raises_a_usage_error_that_names_the_topics_verb(shared: Daemon) -> None:
-    with connect(shared.endpoint) as robot:
-        uses: list[Any] = [robot.get, robot._connection.subscribe, robot.messages]
-        for use in uses:
-            with pytest.raises(UsageError, match="acsard topics"):
-                use("xyz//x")
 
 
 def test_a_query_that_the_daemon_refuses_raises_the_daemon_s_reason(shared: Daemon) -> None:
@@ -383,17 +223,6 @@ def test_a_put_on_a_wildcard_is_not_taken_for_a_message_of_the_robot(
         while (sample := states.try_recv()) is not None:
             names.append(str(sample.key_expr))
     assert set(names) == {"acsard/acsar/state"}
-
-
-def test_services_answer_with_success_and_a_message(shared: Daemon, fresh: Bus) -> None:
-    with connect(shared.endpoint) as robot:
-        assert robot.call("stop").success
-        refused = robot.call("activate")
-        assert (refused.success, "srv/clear" in refused.message) == (False, True)
-        assert robot.call("clear").success
-        assert robot.call("set_pose", x=1.0, y=2.0, yaw=0.5).success
-        pose = robot.pose()
-        assert (pose.x, pose.y, pose.yaw) == pytest.approx((1.0, 2.0, 0.5))
 
 
 @pytest.mark.slow
@@ -447,21 +276,6 @@ def test_move_and_turn_end_within_five_millimetres_and_half_a_degree(
     assert pose.x == pytest.approx(0.5, abs=0.005 + 0.02 * late)
     assert pose.y == pytest.approx(0.3, abs=0.005 + 0.02 * late)
     assert math.degrees(pose.yaw) == pytest.approx(0.0, abs=1.0 + 3.0 * late)
-
-
-def test_a_stop_ends_a_move_with_the_reason(shared: Daemon, fresh: Bus) -> None:
-    with connect(shared.endpoint) as robot, ThreadPoolExecutor(1) as other:
-
-        def stop() -> None:
-            until(lambda: (fresh.state()["linear"] or 0.0) > 0.1, 5.0, "driving")
-            robot.stop()
-
-        stopping = other.submit(stop)
-        with pytest.raises(NotDrivenError, match="stopped by"):
-            robot.move(30.0)
-        stopping.result()
-        assert robot.pose().x < 3.0
-        assert robot.clear().success
 
 
 async def test_an_asyncio_program_moves_stops_and_clears(shared: Daemon, fresh: Bus) -> None:
@@ -560,67 +374,6 @@ def test_a_reader_sleeps_between_messages(shared: Daemon, fresh: Bus) -> None:
 
 
 @pytest.mark.slow
-def test_a_drive_begins_and_ends_with_a_zero(shared: Daemon, fresh: Bus) -> None:
-    with connect(shared.endpoint) as robot, fresh.follow("cmd/app") as commands:
-        begun = time.monotonic()
-        robot.drive(0.3, 0.1, seconds=0.2)
-        missed = lost(begun) / 0.05  # it sends at 20 Hz
-        commands.find(lambda value: value["linear"]["x"] == 0.3, 2.0, "the command")
-        speeds = until(
-            lambda: _ended([entry.value["linear"]["x"] for entry in commands.seen]),
-            2.0,
-            "the last zero",
-        )
-        assert speeds[0] == 0.0
-        assert 3 - missed <= speeds.count(0.3) <= 6
-        assert commands.seen[0].encoding == "application/msgpack;acsard.Twist.v1"
-
-
-def _ended(speeds: list[float]) -> list[float]:
-    return speeds if len(speeds) > 2 and speeds[-1] == 0.0 else []
-
-
-def test_a_drive_that_is_interrupted_sends_a_zero(shared: Daemon, fresh: Bus) -> None:
-    class InterruptionError(Exception):
-        pass
-
-    def drive_and_fail(robot: Any) -> None:
-        for count, _ in enumerate(robot.messages("odom", timeout=2.0)):
-            robot.send(0.3)
-            if count > 20:
-                raise InterruptionError
-
-    with fresh.follow("cmd/app") as commands:
-        with pytest.raises(InterruptionError), connect(shared.endpoint) as robot:
-            drive_and_fail(robot)
-        # A source may have a timeout of several seconds, so the robot must not wait for it.
-        until(
-            lambda: _ended([entry.value["linear"]["x"] for entry in commands.seen]),
-            1.0,
-            "the last zero",
-        )
-    until(lambda: fresh.state()["mode"] == "ready", 1.0, "the source is gone")
-
-
-# asyncio
-
-
-@pytest.mark.slow
-async def test_an_async_drive_runs_while_odometry_is_followed(shared: Daemon, fresh: Bus) -> None:
-    begun, messages = time.monotonic(), []
-    async with connect_async(shared.endpoint) as robot:
-        driving = asyncio.create_task(robot.drive(0.5, seconds=0.6))
-        async for odom in robot.messages("odom"):
-            messages.append(odom)
-            if driving.done() and odom.twist.twist.linear.x == 0.0:
-                break
-    late = lost(begun)
-    assert len(messages) > 60 - 100 * late
-    assert max(odom.twist.twist.linear.x for odom in messages) > 0.4
-    assert messages[-1].pose.pose.position.x == pytest.approx(0.3, abs=0.03 + 0.5 * late)
-
-
-@pytest.mark.slow
 async def test_a_connection_that_does_not_close_keeps_the_error_of_the_program(
     shared: Daemon, fresh: Bus, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -631,32 +384,6 @@ async def test_a_connection_that_does_not_close_keeps_the_error_of_the_program(
     with pytest.raises(NoAnswerError, match="could not be closed"):
         async with connect_async(shared.endpoint):
             pass
-
-
-@pytest.mark.slow
-async def test_cancelling_an_async_drive_sends_the_zero_immediately(
-    shared: Daemon, fresh: Bus
-) -> None:
-    with fresh.follow("cmd/app") as commands:
-        async with connect_async(shared.endpoint) as robot:
-            driving = asyncio.create_task(robot.drive(0.5, seconds=60.0))
-            async for odom in robot.messages("odom"):
-                if odom.twist.twist.linear.x > 0.2:
-                    break
-            cancelled = time.monotonic()
-            driving.cancel()
-            with pytest.raises(asyncio.CancelledError):
-                await driving
-            state = await robot.get("state")
-            assert isinstance(state, schema.RobotState)
-        zero = commands.find(
-            lambda value: value["linear"]["x"] == 0.0, 2.0, "a zero", after=cancelled
-        )
-    print(f"cancel -> zero on the bus: {zero.at - cancelled:.4f} s")
-    assert zero.at - cancelled < 0.2 + lost(cancelled, zero.at)
-    assert not [
-        entry for entry in commands.seen if entry.at > zero.at and entry.value["linear"]["x"] != 0.0
-    ]
 
 
 @pytest.mark.slow
@@ -706,13 +433,6 @@ async def test_a_zero_sent_right_after_a_command_is_not_lost(shared: Daemon, fre
             await robot.get("info")
         fresh.get("info")  # after everything that was sent: the command itself may be dropped
         until(lambda: commands.seen[-1].value["linear"]["x"] == 0.0, 1.0, "a last zero")
-
-
-async def test_an_async_call_and_pose_leave_the_loop_running(shared: Daemon, fresh: Bus) -> None:
-    async with connect_async(shared.endpoint) as robot:
-        assert (await robot.call("set_pose", x=4.0, y=0.0, yaw=0.0)).success
-        # Compare to a tenth of a millimetre, because wheels that come to rest creep.
-        assert (await robot.pose()).x == pytest.approx(4.0, abs=1e-4)
 
 
 def test_the_client_repeats_a_query_to_a_busy_daemon_and_never_a_service_call() -> None:

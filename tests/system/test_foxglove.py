@@ -40,9 +40,6 @@ TOPICS = {
 }
 """The ROS type, and the bus key with the same contents."""
 
-OURS = {"header": "stamp", "sources": "sources", "counters": "counters"}
-"""The fields of `state` that have another shape on the bus."""
-
 
 def free_port() -> int:
     """Return a port of this machine on which no program listens."""
@@ -119,20 +116,6 @@ def test_a_topic_shows_what_was_on_the_bus_at_the_time(
         until(lambda: found() >= count - 1, 5.0, f"{messages} on {key}")
 
 
-def test_the_state_shows_what_was_on_the_bus_at_the_time(viewer: Viewer, bus: Bus) -> None:
-    with bus.follow("state") as on_bus:
-        looked = viewer.show("/state")
-        message = looked.read(looked.first(3)[-1].payload)
-        entry = on_bus.find(lambda v: same(message.header.stamp, v["stamp"]), 5.0, "that state")
-    fields = {k: v for k, v in entry.value.items() if hasattr(message, k) and v is not None}
-    assert set(fields) >= {"mode", "reason", "x", "y", "yaw", "wheels", "link", "source", "gyro"}
-    assert all(same(getattr(message, k), v) for k, v in fields.items() if k not in OURS.values())
-    assert {item.name: item.count for item in message.counters} == entry.value["counters"]
-    assert [item.name for item in message.sources] == [
-        item["name"] for item in entry.value["sources"]
-    ]
-
-
 def test_foxglove_shows_the_topics_of_a_recording_and_no_others(viewer: Viewer) -> None:
     until(lambda: set(viewer.channels) >= set(TOPICS), 5.0, "all topics")
     types = {topic: channel["schemaName"] for topic, channel in viewer.channels.items()}
@@ -195,7 +178,7 @@ def test_a_key_is_subscribed_only_while_a_viewer_shows_it(viewer: Viewer, bus: B
     publisher.undeclare()
 
 
-def test_a_viewer_can_stop_the_robot_and_do_nothing_else(viewer: Viewer, bus: Bus) -> None:
+def test_a_viewer_has_no_service_but_stop_and_publishes_nothing(viewer: Viewer, bus: Bus) -> None:
     assert viewer.info["capabilities"] == ["services"]
     assert set(viewer.services) == {"/acsard/stop"}
     looked = viewer.show("/odom")
@@ -204,9 +187,6 @@ def test_a_viewer_can_stop_the_robot_and_do_nothing_else(viewer: Viewer, bus: Bu
     send(json.dumps({"linear": {"x": 0.3}, "angular": {}}).encode())
     looked.first(len(looked.came) + 20)
     assert bus.count("commands") == before
-    assert viewer.call("/acsard/stop", {})["success"]
-    assert bus.state()["mode"] == "stopped"
-    assert bus.get("srv/clear")["success"]
 
 
 @SLOW

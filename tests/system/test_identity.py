@@ -165,19 +165,3 @@ def test_a_page_server_connected_over_tls_drives_under_its_certificate_s_name(
     with Page(robot.daemon, tmp_path, *by_tls) as page, Bus(robot.plain) as bus:
         run(story)
         bus.at_rest()
-
-
-def test_a_certificate_commands_on_no_key_but_its_own(robot: Robot) -> None:
-    def commands(bus: Bus) -> int:
-        counters = bus.state()["counters"]
-        return sum(n for name, n in counters.items() if name.startswith("command"))
-
-    with robot.operator() as session, Bus(robot.plain) as bus:
-        before = commands(bus)
-        for certificate in ("", "/maintainer", "/viewer", "/*", "/operator/more", "/operato$*"):
-            for kind, payload in (("cmd", twist(0.1)), ("wheel_cmd", {})):
-                session.put(f"acsard/acsar/{kind}/app{certificate}", json.dumps(payload))
-        assert list(session.get("acsard/acsar/info", timeout=5.0))
-        assert commands(bus) == before
-        session.put("acsard/acsar/cmd/app/operator", json.dumps(twist(0.0)))
-        until(lambda: commands(bus) > before, 5.0, "the command on its own key")

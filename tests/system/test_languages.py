@@ -24,18 +24,17 @@ from aiohttp.test_utils import TestServer
 
 from tests.pages import blocks
 from tests.system.browser import Page
-from tests.system.builds import program, run
+from tests.system.builds import CLIENTS, copied, node_program, program, run
 from tests.system.harness import (
-    ROOT,
     Bus,
     Daemon,
     Program,
     environment,
+    finish,
     free_endpoint,
     until,
 )
 
-CLIENTS = ROOT / "deploy/clients"
 BRIDGE = "zenoh-bridge-remote-api"
 
 
@@ -86,18 +85,6 @@ def driven(words: Sequence[str], where: Path, bus: Bus, **more: str) -> None:
     bus.at_rest()
 
 
-def printed(page: Page) -> str:
-    """Return the page's local address as the page prints it, with a slash at the end."""
-    return f"{page.here}/"
-
-
-def node_program(where: Path) -> list[str]:
-    """Return the words that run the program for Node."""
-    node = program("node", "it runs the program")
-    flags = ["--experimental-websocket"] if run([node, "--version"], where) < "v22" else []
-    return [node, *flags, str(CLIENTS / "node/drive.mjs")]
-
-
 @pytest.mark.slow
 async def test_the_node_program_says_why_the_page_closed_its_connection(tmp_path: Path) -> None:
     async def closes(request: web.Request) -> web.WebSocketResponse:
@@ -122,63 +109,32 @@ async def test_the_node_program_says_why_the_page_closed_its_connection(tmp_path
 
 @pytest.mark.slow
 @pytest.mark.nightly
-def test_the_node_program_drives_the_robot(page: Page, standing: Bus, tmp_path: Path) -> None:
-    words = node_program(tmp_path)
-    driven([*words, printed(page)], tmp_path, standing)
-    away = [*words, page.away, page.invite("operator", "node")]
-    driven(away, tmp_path, standing, NODE_EXTRA_CA_CERTS=str(page.tls / "ca.pem"))
+def test_the_node_program_drives_the_robot_from_another_host(
+    page: Page, standing: Bus, tmp_path: Path
+) -> None:
+    words = [*node_program(tmp_path), page.away, page.invite("operator", "node")]
+    driven(words, tmp_path, standing, NODE_EXTRA_CA_CERTS=str(page.tls / "ca.pem"))
 
 
 @pytest.mark.slow
 @pytest.mark.nightly
-def test_the_java_program_drives_the_robot(page: Page, standing: Bus, tmp_path: Path) -> None:
+def test_the_java_program_says_that_no_robot_answers(tmp_path: Path) -> None:
     java = program("java", "it runs the program")
-    words = [java, str(CLIENTS / "java/Drive.java")]
-    driven([*words, printed(page)], tmp_path, standing)
     nowhere = f"http://{free_endpoint().partition('/')[2]}"
-    missing = subprocess.run(
-        [*words, nowhere], capture_output=True, text=True, timeout=60, check=False
-    )
-    assert missing.returncode == 1, missing
-    assert missing.stderr.startswith(f"no connection to {nowhere}: "), missing
+    missing = finish([java, str(CLIENTS / "java/Drive.java"), nowhere], tmp_path, 60.0)
+    assert missing.code == 1, missing
+    assert missing.err.startswith(f"no connection to {nowhere}: "), missing
 
 
 @pytest.mark.languages
 @pytest.mark.timeout(300)
-def test_the_go_program_drives_the_robot(page: Page, standing: Bus, kept: Path) -> None:
-    go = program("go", "it builds the program")
+def test_the_go_program_drives_the_robot_from_another_host(
+    page: Page, standing: Bus, kept: Path
+) -> None:
     here = copied("go", kept)
-    run([go, "build", "-o", "drive", "."], here)
-    driven([str(here / "drive"), printed(page)], here, standing)
+    run([program("go", "it builds the program"), "build", "-o", "drive", "."], here)
     away = [str(here / "drive"), page.away, page.invite("operator", "go")]
     driven(away, here, standing, SSL_CERT_FILE=str(page.tls / "ca.pem"))
-
-
-@pytest.mark.slow
-def test_the_program_for_curl_stops_and_releases_the_robot(page: Page, standing: Bus) -> None:
-    program("curl", "the program calls it")
-
-    here = {"ADDRESS": printed(page)}
-    away = {"ADDRESS": page.away, "CURL_CA_BUNDLE": str(page.tls / "ca.pem")}
-
-    def asks(verb: str, robot: dict[str, str] = here) -> dict[str, Any]:
-        done = called(verb, robot)
-        assert done.returncode == 0, done
-        answer: dict[str, Any] = json.loads(done.stdout)
-        return answer
-
-    assert asks("state")["mode"] == "ready"
-    assert asks("stop")["success"] is True
-    assert standing.state()["mode"] == "stopped"
-    answer = asks("clear")
-    assert answer["success"] is True, answer
-    until(lambda: standing.state()["mode"] == "ready", 5.0, "it is released")
-    viewer = away | {"TOKEN": page.invite("viewer", "curl")}
-    assert asks("stop", viewer)["success"] is True
-    refused = called("clear", viewer)
-    assert refused.returncode != 0, refused
-    assert standing.state()["mode"] == "stopped"
-    assert asks("clear")["success"] is True
 
 
 @pytest.mark.parametrize("verb", ["state", "stop", "clear"])
@@ -227,12 +183,6 @@ def commands() -> list[str]:
     """Return the commands that the page asks the reader to type."""
     page = "deploy/clients/README.md"
     return [line for block in blocks("sh") if block.page == page for line in block.commands()]
-
-
-def copied(language: str, cache: Path) -> Path:
-    """Copy the example of a language into the build directory, which keeps earlier builds."""
-    built = shutil.ignore_patterns("target", "node_modules", "dist", "*lock*")
-    return shutil.copytree(CLIENTS / language, cache / language, ignore=built, dirs_exist_ok=True)
 
 
 @pytest.mark.languages

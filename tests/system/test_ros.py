@@ -4,15 +4,15 @@ These tests run with an emulated bridge, which has only the Zenoh half, and with
 ROS nodes on DDS. The build of the real bridge takes long, so its tests have the mark `bridge`
 instead of `network`.
 
-`test_rmw.py` and `test_ros_bridge.py` test the protocol of each transport.
+`test_ros_rmw.py` and `test_ros_bridge.py` test the protocol of each transport.
 """
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import ExitStack
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
@@ -45,12 +45,7 @@ from tests.system.ros_clients import (
     decode,
     encode,
     header,
-    joints,
     make,
-    refused_without_motion,
-    released,
-    settled,
-    stamped,
     twist,
     unharmed,
 )
@@ -189,97 +184,7 @@ def _speed(payload: bytes) -> float:
     return float(decode(ODOMETRY, payload).twist.twist.linear.x)
 
 
-@pytest.mark.usefixtures("restored")
-def test_teleop_commands_have_priority_over_navigation_commands(bus: Bus, ros: Client) -> None:
-    def drives(state: Any, source: str, sign: float) -> bool:
-        return state["source"] == source and sign * (state["linear"] or 0.0) > 0.1
-
-    with bus.follow("state") as states, ros.driving(bus, "cmd_vel", TWIST, 0.3):
-        states.find(lambda s: drives(s, "nav", 1.0), 3.0, "nav drives")
-        with ros.driving(bus, "cmd_vel_teleop", TWIST, -0.2):
-            states.find(lambda s: drives(s, "teleop", -1.0), 3.0, "teleop drives")
-        released_at = time.monotonic()
-        states.find(lambda s: drives(s, "nav", 1.0), 3.0, "nav again", after=released_at)
-
-
-def test_a_stop_ends_a_drive_and_clear_does_not_resume_it(bus: Bus, ros: Client) -> None:
-    with bus.follow("state") as states, ros.driving(bus, "cmd_vel", TWIST, 0.3):
-        states.find(lambda s: (s["linear"] or 0.0) > 0.1 and s["source"] == "nav", 3.0, "it drives")
-        assert ros.call("acsard/stop").trigger()[0]
-        states.find(lambda s: s["mode"] == "stopped" and not any(s["wheels"]), 3.0, "it stands")
-        assert not ros.call("acsard/clear").trigger()[0]
-        released(ros)
-        lines = bus.count("lines_sent")
-        until(lambda: bus.count("lines_sent") > lines + 20, 3.0, "20 periods")
-        # This sender never sent a zero, so it does not drive on.
-        assert not any(bus.state()["wheels"])
-    settled(bus)
-
-
 GO = twist(0.5)
-
-WRONG = {
-    "NaN": ("cmd_vel", TWIST, twist(float("nan")), "not_finite", "NaN"),
-    "a wheel missing": (
-        "joint_commands", JOINTS, joints(6.0, WHEELS[:3]), "wrong_wheels", "rear_right",
-    ),
-    "a wheel of another robot": (
-        "joint_commands", JOINTS, joints(6.0, [*WHEELS[:3], "wheel_4"]), "wrong_wheels",
-        "rear_right",
-    ),
-}  # fmt: skip
-"""Messages that a node can send: topic, type, payload, counter and a word of the logged reason."""
-
-
-@pytest.mark.parametrize("name", WRONG)
-def test_a_wrong_command_is_counted_and_reported_and_moves_nothing(
-    bus: Bus, ros: Client, name: str
-) -> None:
-    topic, kind, payload, reason, text = WRONG[name]
-    ros.zeros(bus)
-    refused_without_motion(bus, lambda: ros.put(topic, kind, payload), reason, text)
-
-
-class Bad(NamedTuple):
-    """A malformed message on `cmd_vel`, and how the daemon counts and logs its refusal."""
-
-    payload: bytes
-    reason: str
-    said: str
-    kind: str = TWIST
-
-
-BAD = {
-    "a twist cut short": Bad(GO[:-1], "malformed", "ends after 51"),
-    "a stamped twist cut short": Bad(stamped(0.5)[:-1], "malformed", "ends after 75", kind=STAMPED),
-    "nothing": Bad(b"", "malformed", "header"),
-    "JSON": Bad(b'{"linear":{"x":0.5},"angular":{}}', "malformed", "header"),
-    "5 kB": Bad(GO + bytes(5000), "too_big", "bytes"),
-}
-
-
-@pytest.mark.parametrize("name", BAD)
-def test_damaged_bytes_are_counted_and_reported_and_move_nothing(
-    bus: Bus, zenoh_ros: ZenohClient, name: str
-) -> None:
-    bad = BAD[name]
-    zenoh_ros.zeros(bus)
-    send: Callable[[], None] = lambda: zenoh_ros.put("cmd_vel", bad.kind, bad.payload)  # noqa: E731
-    refused_without_motion(bus, send, bad.reason, bad.said)
-
-
-@pytest.mark.parametrize(
-    ("topic", "kind"), [("cmd_vel", TWIST), ("cmd_vel_teleop", TWIST), ("joint_commands", JOINTS)]
-)
-def test_a_delete_is_counted_and_reported_and_moves_nothing(
-    bus: Bus, zenoh_ros: ZenohClient, topic: str, kind: str
-) -> None:
-    zenoh_ros.zeros(bus)
-    key, attachment = zenoh_ros.key(topic, kind), zenoh_ros.attachment()
-    refused_without_motion(
-        bus, lambda: zenoh_ros.session.delete(key, attachment=attachment), "not_a_put", "DELETE"
-    )
-
 
 WILDCARDS = {
     RmwClient: ("0/cmd_vel/**", "*/cmd_vel/*/*", "0/**", "**"),
@@ -365,21 +270,6 @@ def _limit(value: float) -> Any:
     none |= {f"{kind}_value": np.array([]) for kind in lists}
     double = make("rcl_interfaces/msg/ParameterValue", type=3, double_value=value, **none)
     return make("rcl_interfaces/msg/Parameter", name="limits.linear_speed", value=double)
-
-
-def test_a_ros_parameter_sets_the_live_setting_within_its_range(bus: Bus, ros: Client) -> None:
-    def ask(value: float) -> Any:
-        return call_parameters(ros, "set_parameters", parameters=[_limit(value)]).results[0]
-
-    before = bus.get("config")["limits"]["linear_speed"]
-    try:
-        assert ask(0.6).successful
-        assert bus.get("config")["limits"]["linear_speed"] == 0.6
-        refused = ask(60.0)
-        assert (refused.successful, "from 0 to 10 m/s" in refused.reason) == (False, True)
-        assert bus.get("config")["limits"]["linear_speed"] == 0.6
-    finally:
-        assert ask(before).successful
 
 
 QUERIES = {

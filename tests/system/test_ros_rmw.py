@@ -367,15 +367,6 @@ def test_a_command_with_a_wrong_attachment_is_counted_and_reported_and_moves_not
     )
 
 
-def test_a_command_held_up_on_the_way_is_stale_by_its_attachment(bus: Bus, ros: RmwClient) -> None:
-    def late() -> None:
-        attached = ros.attachment(age=1.0)
-        ros.session.put(ros.key("cmd_vel", TWIST), GO, attachment=attached)
-
-    ros.zeros(bus)
-    refused_without_motion(bus, late, "stale", "the network delays them")
-
-
 def test_a_command_of_a_sender_whose_clock_is_an_hour_off_is_accepted(
     bus: Bus, ros: RmwClient
 ) -> None:

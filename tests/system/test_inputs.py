@@ -1,140 +1,32 @@
-"""The daemon refuses, counts and logs every bad command on the real bus, and nothing moves."""
+"""Huge values, huge messages and floods disturb neither the robot nor other clients."""
 
 from __future__ import annotations
 
-import json
-import math
 import struct
 import time
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, NamedTuple, get_args
+from typing import get_args
 
-import msgspec
 import pytest
 
 from acsard.core.codes import AgeCode
 from tests.system.bystander import lost
 from tests.system.harness import (
-    ZERO,
     Bus,
     Daemon,
     Periods,
     Program,
     kept_waiting,
     resident_kb,
-    twist,
     until,
     waited_for_a_core,
 )
-from tests.system.ros_clients import TWIST, rmw_key
+from tests.system.ros_clients import TWIST, WHEELS, rmw_key
 from tests.system.ros_clients import twist as ros_twist
 from tests.system.strangers import FLOOD, command_line
 
 TICK_S = 0.01
-
-GO = json.dumps(twist(0.5)).encode()
-JOINTS = [f"{wheel}_wheel_joint" for wheel in ("front_right", "front_left", "rear_left")]
-ALL_JOINTS = [*JOINTS, "rear_right_wheel_joint"]
-
-
-class Bad(NamedTuple):
-    """A bad command, and how the daemon must refuse it.
-
-    `reason` is the name of the counter, and `said` a part of the reported reason. A payload of None
-    is a DELETE.
-    """
-
-    payload: bytes | None
-    reason: str
-    said: str
-    key: str = "cmd/app"
-    encoding: str | None = None
-
-
-def pack(value: object) -> bytes:
-    return msgspec.msgpack.encode(value)
-
-
-def stamped(seconds: float) -> bytes:
-    """Return a speed in JSON whose stamp is `seconds` old."""
-    sec, nanosec = divmod(int((time.time() - seconds) * 1e9), 10**9)
-    stamp = {"sec": sec, "nanosec": nanosec}
-    return json.dumps({"header": {"stamp": stamp}, "twist": twist(0.5)}).encode()
-
-
-BAD = [
-    Bad(GO[:-3], "malformed", "cmd/app"),
-    Bad(pack(twist(math.nan)), "not_finite", "NaN"),
-    Bad(b"forward!", "unknown_encoding", "not a JSON object"),
-    Bad(GO, "wrong_shape", "cmd/app", encoding="application/msgpack"),
-    Bad(pack(twist(0.5)), "malformed", "cmd/app", encoding="application/json"),
-    Bad(GO + b" " * 60_000, "too_big", "bytes"),
-    Bad(GO, "unknown_source", "this source is not in commands.sources", "cmd/stranger"),
-    Bad(GO, "wildcard", "exact key", "cmd/*"),
-    Bad(GO, "wildcard", "exact key", "cmd/a$*"),
-    Bad(GO, "wildcard", "exact key", "wheel_cmd/*"),
-    Bad(GO, "wildcard", "exact key", "acsard/*/cmd/app"),
-    Bad(pack({"name": [], "velocity": []}), "wrong_wheels", "rear_right", "wheel_cmd/app"),
-    Bad(None, "not_a_put", "DELETE"),
-    Bad(None, "not_a_put", "DELETE", "wheel_cmd/app"),
-    Bad(None, "wildcard", "exact key", "cmd/*"),
-]
-"""One of each reason, and the forms that only a real bus can show.
-
-`tests/unit/core/incoming/test_commands.py` has all payloads.
-"""
-
-
-def refused_without_motion(bus: Bus, *bad: Bad) -> None:
-    """Send these bad commands. Check that each is counted and reported, and that nothing moves."""
-    # The source may drive: if a bad command were accepted, the robot would move.
-    commands = bus.count("commands")
-    bus.put("cmd/app", ZERO)
-    until(lambda: bus.count("commands") > commands, 5.0, "the zero was received")
-    before = state = bus.state()
-    for payload, reason, text, key, encoding in bad:
-        name, counted = f"command_{reason}", state["counters"].get(f"command_{reason}", 0)
-        whole = key if "acsard" in key else f"acsard/acsar/{key}"
-        # The daemon's session drops a sample that follows within 1 ms of one with the same key.
-        time.sleep(0.003)
-        if payload is None:
-            bus.session.delete(whole)
-        else:
-            bus.session.put(whole, payload, encoding=encoding)
-
-        def told(name: str = name, counted: int = counted) -> Any:
-            state = bus.state()
-            return state if state["counters"].get(name, 0) > counted else None
-
-        state = until(told, 3.0, f"{key} is counted as {reason}")
-        assert text in state["refused"], state["refused"]
-        assert len(state["refused"]) <= 300
-    lines = bus.count("lines_sent")
-    until(lambda: bus.count("lines_sent") >= lines + 5, 3.0, "five more lines")
-    after = bus.comes_to("ready", "driving")
-    assert after["counters"]["commands"] == before["counters"]["commands"], "it refreshed something"
-    for part in ("x", "y", "yaw", "linear", "angular", "wheels"):
-        assert after[part] == before[part], part
-    reasons = {k for k in after["counters"] if k.startswith("command_")}
-    changed = {k for k in reasons if after["counters"][k] != before["counters"].get(k, 0)}
-    assert changed == {f"command_{case.reason}" for case in bad}
-
-
-def test_a_bad_command_is_counted_and_reported_and_moves_nothing(bus: Bus) -> None:
-    refused_without_motion(bus, *BAD)
-
-
-def test_a_command_held_up_on_the_way_is_counted_as_stale(bus: Bus) -> None:
-    # The source's own clock is known from here on.
-    before = bus.count("commands")
-
-    def counted() -> bool:
-        bus.session.put("acsard/acsar/cmd/app", stamped(0.0).replace(b"0.5", b"0.0"))
-        return bus.count("commands") > before
-
-    until(counted, 5.0, "stamped zeros")
-    refused_without_motion(bus, Bad(stamped(1.0), "stale", "the network delays them"))
 
 
 def test_enormous_wheel_speeds_are_clamped_to_the_limits(bus: Bus) -> None:
@@ -143,10 +35,10 @@ def test_enormous_wheel_speeds_are_clamped_to_the_limits(bus: Bus) -> None:
     with bus.follow("cmd_vel_out") as applied:
         bus.at_rest()
         count = bus.count("commands")
-        bus.put("wheel_cmd/app", {"name": ALL_JOINTS, "velocity": [0.0] * 4})
+        bus.put("wheel_cmd/app", {"name": WHEELS, "velocity": [0.0] * 4})
         # A message of an earlier test may still arrive after this point.
         until(lambda: bus.count("commands") >= count + 1, 5.0, "the zero was received")
-        bus.put("wheel_cmd/app", {"name": ALL_JOINTS, "velocity": [1e300, 1e300, -1e300, -1e300]})
+        bus.put("wheel_cmd/app", {"name": WHEELS, "velocity": [1e300, 1e300, -1e300, -1e300]})
         until(lambda: bus.count("commands") >= count + 2, 5.0, "the speeds were received")
         until(lambda: bus.state()["mode"] == "ready", 5.0, "their timeout is over")
         until(lambda: bus.state()["linear"] == bus.state()["angular"] == 0, 5.0, "at rest")
@@ -157,20 +49,12 @@ def test_enormous_wheel_speeds_are_clamped_to_the_limits(bus: Bus) -> None:
 
 def test_a_message_over_the_link_s_size_harms_only_its_sender(bus: Bus, shared: Daemon) -> None:
     with Bus(shared.endpoint) as sender:
-        sender.session.put("acsard/acsar/cmd/app", GO + b" " * 1_000_000)
+        sender.session.put("acsard/acsar/cmd/app", b"{" + b" " * 1_000_000)
         lines = bus.count("lines_sent")
         until(lambda: bus.count("lines_sent") > lines + 50, 5.0, "it goes on")
     assert bus.comes_to("ready")["linear"] == 0.0
     with Bus(shared.endpoint) as another:
         another.linked()
-
-
-def test_no_bad_command_raised_an_exception_in_the_daemon(bus: Bus, shared: Daemon) -> None:
-    assert shared.process.poll() is None
-    assert "Traceback" not in shared.stderr
-    assert "Error" not in shared.stderr
-    assert "panicked" not in shared.stderr
-    until(lambda: bus.state()["mode"] == "ready", 5.0, "no program commands any more")
 
 
 @pytest.mark.slow
