@@ -44,7 +44,9 @@ def screen(teleop: Teleop) -> Group:
     if teleop.state is not None:
         parts.append(mode_line(teleop.state))
         if teleop.objection:
-            words = f"your keys do not drive the robot: {printable(teleop.objection)}"
+            words = "your keys do not drive the robot"
+            if teleop.objection not in teleop.state.why:  # which stands above
+                words += f": {printable(teleop.objection)}"
             parts.append(Text(words, "bold red"))
         parts.append(_measured(teleop.state))
     parts.append(Text(f"keys ask for {teleop.linear:.2f} m/s, {teleop.angular:.2f} rad/s"))

@@ -87,7 +87,7 @@ DRIVE = {
     "the keys do not drive": OBJECTED,
     "before the first state": replace(TELEOP, state=None),
     "a silent robot": replace(TELEOP, age=7.0, silent=True),
-    "a long reason": replace(TELEOP, state=replace(WAITING, reason=LONG)),
+    "a long reason": replace(TELEOP, state=replace(WAITING, reason=LONG), objection=LONG),
 }
 ENDS = {
     "it stands": replace(TELEOP, state=STILL),
