@@ -520,19 +520,6 @@ def test_the_readme_names_every_topic_and_service() -> None:
             assert f"`{row.name}`" in text, row.name
 
 
-def test_the_toml_of_the_readme_is_accepted() -> None:
-    text = (FILES / "README.md").read_text()
-    blocks = re.findall(r"^```toml\n(.*?)^```", text, re.M | re.S)
-    assert len(blocks) >= 6
-    for block in blocks:
-        tables: dict[str, Any] = msgspec.toml.decode(block)
-        for table, values in tables.items():
-            kind = type(getattr(CONFIG, table))
-            known = {field.name for field in msgspec.structs.fields(kind)}
-            assert set(values) <= known
-            msgspec.convert(values, kind)
-
-
 def test_the_readme_starts_a_bridge_over_the_network_below_the_robot_s_namespace() -> None:
     """Over the network each robot has a namespace.
 
