@@ -17,7 +17,7 @@ from tests.system.chromium import CHROMIUM, DESKTOP, PHONE, SIDEWAYS, browsing
 from tests.system.harness import until
 from tests.tools import pictures
 from tests.tools.pictures import LOOKS
-from tests.unit.recording.test_html_report import drive_of_two, evil, report
+from tests.unit.test_recording_report import drive_of_two, evil, report
 
 BROWSER = shutil.which("chromium")
 

@@ -19,8 +19,8 @@ from tests.each import each
 from tests.scenarios.taped import Tape, recorded_world
 from tests.scenarios.world import START, World
 from tests.system.typed import typed
-from tests.unit.recording.test_html_report import traces
 from tests.unit.test_checkup_verb import on_terminal
+from tests.unit.test_recording_report import traces
 
 RECORDED = "000007-20270115T080000Z.rec.zst"
 

@@ -22,42 +22,34 @@ from acsard.recording.file import (
     FrameWriter,
     Head,
     Recording,
-    Steps,
     encode_steps,
     listed,
 )
 from acsard.recording.recorded_steps import FinishedStep, RecordedStep
 from tests.each import each
-from tests.scenarios.taped import Tape
-from tests.scenarios.world import World
+from tests.unit.drives import drive
 
 Taken = list[FinishedStep]
 
+TAKEN = drive().taken
+
 SECOND = 200  # steps in a record of these tests
-
-
-@pytest.fixture(scope="module")
-def taken() -> Taken:
-    tape = Tape()
-    world = World(recorder=tape)
-    world.drive(0.5, 0.3, 3.0)
-    world.call("stop")
-    world.run(1.0)
-    return tape.taken
 
 
 def head(number: int, at: Instant) -> Head:
     return Head("0.2.0", "acsar", number, at.mono_ns, at.wall_ns, "[robot]\n", b"state")
 
 
-def write(taken: Taken, seconds_per_frame: int = 2) -> bytes:
-    """Return the content of a file with these steps."""
+def write(taken: Taken, seconds_per_frame: int = 2, ends: list[int] | None = None) -> bytes:
+    """Return the content of a file with these steps. `ends` gets the end of each second."""
     file = io.BytesIO()
     frames = FrameWriter(file)
     for count, at in enumerate(range(0, len(taken), SECOND)):
         if count % seconds_per_frame == 0:
             frames.begin(head(at, taken[at].now))
         frames.add(encode_steps(at, taken[at : at + SECOND]))
+        if ends is not None:
+            ends.append(file.tell())
     frames.end()
     return file.getvalue()
 
@@ -89,70 +81,60 @@ def frames_in(data: bytes) -> list[int]:
     return found
 
 
-def test_every_step_is_read_as_it_was_written(taken: Taken, tmp_path: Path) -> None:
+def test_every_step_is_read_as_it_was_written(tmp_path: Path) -> None:
     path = tmp_path / "a"
-    path.write_bytes(write(taken))
+    path.write_bytes(write(TAKEN))
     recording = Recording([path])
     steps = list(recording.steps())
     assert recording.damage == []
-    assert [step.now for step in steps] == [entry.now for entry in taken]
-    assert [step.heard for step in steps] == [entry.heard for entry in taken]
-    assert [step.driven for step in steps] == [entry.driven for entry in taken]
-    assert [step.recorded.line for step in steps] == [entry.line for entry in taken]
-    assert [step.recorded.sent for step in steps] == [entry.sent for entry in taken]
-    assert [step.recorded.status.mode for step in steps] == [entry.status.mode for entry in taken]
-    assert [step.recorded.events for step in steps] == [entry.news.events for entry in taken]
-    assert [step.number for step in steps if step.begins] == list(range(0, len(taken), SECOND))
-    assert recording.head() == head(0, taken[0].now)
+    for step, entry in zip(steps, TAKEN, strict=True):
+        assert (step.now, step.heard, step.driven) == (entry.now, entry.heard, entry.driven)
+        assert (step.recorded.line, step.recorded.sent) == (entry.line, entry.sent)
+        assert step.recorded.status.mode == entry.status.mode
+        assert step.recorded.events == entry.news.events
+    assert [step.number for step in steps if step.begins] == list(range(0, len(TAKEN), SECOND))
+    assert recording.head() == head(0, TAKEN[0].now)
 
 
-def test_a_file_that_was_cut_off_at_any_byte_has_every_complete_second(
-    taken: Taken, tmp_path: Path
-) -> None:
-    data = write(taken)
-    file = io.BytesIO()
-    frames, ends = FrameWriter(file), []
-    for count, at in enumerate(range(0, len(taken), SECOND)):
-        if count % 2 == 0:
-            frames.begin(head(at, taken[at].now))
-        frames.add(encode_steps(at, taken[at : at + SECOND]))
-        ends.append(len(file.getvalue()))
-    for cut in range(0, len(data), 61):
+def test_a_file_that_was_cut_off_at_any_byte_has_every_complete_second(tmp_path: Path) -> None:
+    ends: list[int] = []
+    data = write(TAKEN, ends=ends)
+    for cut in range(0, len(data), len(data) // 50):
         numbers, recording = read(tmp_path / "a", data[:cut])
         complete = sum(end <= cut for end in ends)
-        assert numbers == list(range(min(complete * SECOND, len(taken)))), cut
+        assert numbers == list(range(min(complete * SECOND, len(TAKEN)))), cut
         assert recording.damage == [], cut
 
 
-def test_damage_costs_the_rest_of_its_frame_and_is_said(taken: Taken, tmp_path: Path) -> None:
-    data, dice = write(taken), random.Random(1)
+def test_damage_costs_the_rest_of_its_frame_and_is_said(tmp_path: Path) -> None:
+    data, dice = write(TAKEN), random.Random(1)
     starts = [*frames_in(data), len(data)]
     for _ in range(60):
         at = dice.randrange(len(data) - 16)
         damaged = data[:at] + dice.randbytes(16) + data[at + 16 :]
         numbers, recording = read(tmp_path / "a", damaged)
         hit = [i for i in range(len(starts) - 1) if starts[i] < at + 16 and at < starts[i + 1]]
-        whole = {n for n in range(len(taken)) if n // (2 * SECOND) not in hit}
+        whole = {n for n in range(len(TAKEN)) if n // (2 * SECOND) not in hit}
         assert whole <= set(numbers), at
         assert numbers == sorted(set(numbers)), at
         # The last bytes of a frame are its end mark only, which nothing needs.
-        assert recording.damage or len(numbers) == len(taken), at
+        assert recording.damage or len(numbers) == len(TAKEN), at
 
 
-def test_a_damaged_length_costs_only_its_frame(taken: Taken, tmp_path: Path) -> None:
+def test_a_damaged_length_costs_only_its_frame(tmp_path: Path) -> None:
     """The second frame seems to have a block that reaches beyond the end of the file."""
-    data = bytearray(write(taken))
+    data = bytearray(write(TAKEN))
     starts = frames_in(bytes(data))
     block = starts[1] + len(MAGIC) + 2
     data[block : block + 3] = (131_000 << 3 | 2 << 1).to_bytes(3, "little")
     assert len(data) < 131_000
     numbers, recording = read(tmp_path / "a", bytes(data))
-    assert numbers == [n for n in range(len(taken)) if not 2 * SECOND <= n < 4 * SECOND]
+    assert numbers == [n for n in range(len(TAKEN)) if not 2 * SECOND <= n < 4 * SECOND]
     assert len(recording.damage) == 1
 
 
-def test_a_missing_frame_is_a_gap_in_the_numbers(taken: Taken, tmp_path: Path) -> None:
-    data = write(taken)
+def test_a_missing_frame_is_a_gap_in_the_numbers(tmp_path: Path) -> None:
+    data = write(TAKEN)
     first, second, third = frames_in(data)[:3]
     numbers, recording = read(tmp_path / "a", data[first:second] + data[third:])
     assert numbers[: 2 * SECOND] == list(range(2 * SECOND))
@@ -197,7 +179,7 @@ def test_a_frame_that_would_need_much_memory_is_refused(tmp_path: Path) -> None:
         zstandard.ZstdCompressor(compression_params=wide).compressobj(),
         zstandard.ZstdCompressor(level=3).compressobj(),
     ]
-    contents = [b"\0\0\0\1" + b"\0" * (1 << 27), b"\xff\xff\xff\xff\0\0\0\0" + b"\0" * (1 << 27)]
+    contents = [b"\0\0\0\1" + bytes(1 << 20), b"\xff\xff\xff\xff\0\0\0\0" + bytes(1 << 25)]
     for frame, content in zip(frames, contents, strict=True):
         path = tmp_path / "a"
         path.write_bytes(frame.compress(content) + frame.flush())
@@ -207,8 +189,8 @@ def test_a_frame_that_would_need_much_memory_is_refused(tmp_path: Path) -> None:
         assert "memory" in str(damage) or "record has" in str(damage)
 
 
-def test_a_newer_version_may_add_fields_and_services(taken: Taken, tmp_path: Path) -> None:
-    row = msgspec.to_builtins(encode_steps(0, taken[:1]).rows[0], builtin_types=(bytes,))
+def test_a_newer_version_may_add_fields_and_services(tmp_path: Path) -> None:
+    row = msgspec.to_builtins(encode_steps(0, TAKEN[:1]).rows[0], builtin_types=(bytes,))
     row[3] |= {"added": 1, "requests": [{"verb": "dance"}, {"verb": "stop", "loudly": True}]}
     beginning = msgspec.to_builtins(head(0, Instant(0, 0)), builtin_types=(bytes,))
     steps = {"type": "steps", "first": 0, "rows": [[*row, "added"]], "checksum": 0, "added": {}}
@@ -232,12 +214,10 @@ def test_an_older_version_may_lack_fields(tmp_path: Path) -> None:
     assert step.recorded.status.mode == "ready"
 
 
-def test_the_step_in_which_the_daemon_failed_is_the_last_record(
-    taken: Taken, tmp_path: Path
-) -> None:
-    failure = Failure(0, "ZeroDivisionError: division by zero", taken[0].now, taken[0].heard)
+def test_the_step_in_which_the_daemon_failed_is_the_last_record(tmp_path: Path) -> None:
+    failure = Failure(0, "ZeroDivisionError: division by zero", TAKEN[0].now, TAKEN[0].heard)
     path = tmp_path / "a"
-    path.write_bytes(content(head(0, taken[0].now), failure))
+    path.write_bytes(content(head(0, TAKEN[0].now), failure))
     *_, last = Recording([path]).records()
     assert last == failure
 
@@ -246,14 +226,14 @@ def numbers_between(paths: list[Path], begin_ns: int, end_ns: int) -> list[int]:
     return [step.number for step in Recording(paths, begin_ns, end_ns).steps()]
 
 
-def test_steps_between_two_times_are_found_over_all_files(taken: Taken, tmp_path: Path) -> None:
-    walls = [entry.now.wall_ns for entry in taken]
+def test_steps_between_two_times_are_found_over_all_files(tmp_path: Path) -> None:
+    walls = [entry.now.wall_ns for entry in TAKEN]
     half = 2 * SECOND
     paths = [tmp_path / "1", tmp_path / "2"]
-    for path, part in zip(paths, (taken[:half], taken[half:]), strict=True):
+    for path, part in zip(paths, (TAKEN[:half], TAKEN[half:]), strict=True):
         path.write_bytes(write(part, 1))
-    for begin in range(0, len(taken), 300):
-        for end in (begin, begin + 10, begin + half, len(taken) - 1):
+    for begin in range(0, len(TAKEN), 300):
+        for end in (begin, begin + 10, begin + half, len(TAKEN) - 1):
             at = walls[begin], walls[min(end, len(walls) - 1)]
             expected = [
                 n % half if n < half else n - half
@@ -263,27 +243,24 @@ def test_steps_between_two_times_are_found_over_all_files(taken: Taken, tmp_path
             assert numbers_between(paths, *at) == expected, (begin, end)
 
 
-def test_a_frame_outside_the_time_is_not_read(taken: Taken, tmp_path: Path) -> None:
+def test_a_frame_outside_the_time_is_not_read(tmp_path: Path) -> None:
     path = tmp_path / "a"
-    path.write_bytes(write(taken, 1))
-    begin = taken[2 * SECOND + 50].now.wall_ns
-    heads = [r.number for r in Recording([path], begin, begin + 1).records() if isinstance(r, Head)]
-    assert heads == [2 * SECOND]
-    whole = [
-        r for r in Recording([path], begin, begin + 1).records() if isinstance(r, RecordedStep)
-    ]
-    assert len(whole) == SECOND
+    path.write_bytes(write(TAKEN, 1))
+    begin = TAKEN[2 * SECOND + 50].now.wall_ns
+    records = list(Recording([path], begin, begin + 1).records())
+    assert [r.number for r in records if isinstance(r, Head)] == [2 * SECOND]
+    assert sum(isinstance(r, RecordedStep) for r in records) == SECOND
 
 
-def test_a_file_that_ended_before_the_time_is_not_read(taken: Taken, tmp_path: Path) -> None:
+def test_a_file_that_ended_before_the_time_is_not_read(tmp_path: Path) -> None:
     path = tmp_path / "a"
-    path.write_bytes(write(taken))
-    last = taken[-1].now.wall_ns
+    path.write_bytes(write(TAKEN))
+    last = TAKEN[-1].now.wall_ns
     os.utime(path, ns=(last, last))
     assert list(Recording([path], last + 2 * NS_PER_S).records()) == []
     # A copy, by another clock.
     os.utime(path, ns=(0, 0))
-    assert numbers_between([path], last, last) == [len(taken) - 1]
+    assert numbers_between([path], last, last) == [len(TAKEN) - 1]
 
 
 def test_the_files_of_a_directory_are_ordered_by_their_numbers(tmp_path: Path) -> None:
@@ -298,8 +275,3 @@ def test_the_files_of_a_directory_are_ordered_by_their_numbers(tmp_path: Path) -
         names[0],
         names[2],
     ]
-
-
-def test_steps_are_a_struct_of_plain_data(taken: Taken) -> None:
-    steps = encode_steps(7, taken[:50])
-    assert msgspec.msgpack.decode(msgspec.msgpack.encode(steps), type=Steps) == steps

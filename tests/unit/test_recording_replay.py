@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 
 import pytest
@@ -9,22 +10,17 @@ from msgspec.structs import replace
 
 from acsard.core.config.settings import Config
 from acsard.core.robot import Robot
-from acsard.core.values import Command, Instant, Twist
+from acsard.core.values import Command, Instant, Pose, Twist
 from acsard.host.errors import RecordingError
 from acsard.recording.file import MAGIC, Failure, FrameWriter, Head, Recording
+from acsard.recording.recorded_steps import checksum, micropose
 from acsard.recording.replay import Playback
 from acsard.recording.replay_text import describe_difference
-from tests.scenarios.taped import Tape, recorded_world
+from tests.scenarios.taped import Tape
 from tests.scenarios.world import START
+from tests.unit.drives import CONFIG, drive
 
-
-@pytest.fixture(scope="module")
-def tape() -> Tape:
-    tape, world = recorded_world(every=200)
-    world.drive(0.5, 0.3, 3.0)
-    world.call("stop")
-    world.run(1.0)
-    return tape
+TAPE = drive()
 
 
 def played(*paths: Path, other: Config | None = None) -> tuple[list[int], Playback, Recording]:
@@ -33,70 +29,65 @@ def played(*paths: Path, other: Config | None = None) -> tuple[list[int], Playba
     return [step.number for step, _ in playback.steps()], playback, recording
 
 
-def test_a_drive_replays_with_the_same_result(tape: Tape, tmp_path: Path) -> None:
-    numbers, playback, _ = played(tape.save(tmp_path / "a"))
-    assert numbers == list(range(len(tape.taken)))
+@pytest.mark.parametrize("first", [0, 400])
+def test_a_drive_replays_from_its_start_and_from_a_state(first: int, tmp_path: Path) -> None:
+    numbers, playback, _ = played(TAPE.save(tmp_path / "a", CONFIG, first))
+    assert numbers == list(range(first, len(TAPE.taken)))
     assert playback.comparison.same
     assert playback.comparison.exact
     assert playback.gaps == []
 
 
-def test_a_replay_begins_at_a_state(tape: Tape, tmp_path: Path) -> None:
-    numbers, playback, _ = played(tape.save(tmp_path / "a", first=400))
-    assert numbers[0] == 400
-    assert playback.comparison.same
-
-
-def test_a_replay_goes_on_after_damage_at_the_next_state(tape: Tape, tmp_path: Path) -> None:
-    path = tape.save(tmp_path / "a")
+def test_a_replay_goes_on_after_damage_at_the_next_state(tmp_path: Path) -> None:
+    path = TAPE.save(tmp_path / "a")
     data = bytearray(path.read_bytes())
     second = data.index(MAGIC, 1)
     data[second + 100 : second + 116] = b"sixteen bad byte"
     path.write_bytes(data)
     numbers, playback, recording = played(path)
-    assert numbers == [n for n in range(len(tape.taken)) if not 200 <= n < 400]
+    assert numbers == [n for n in range(len(TAPE.taken)) if not 200 <= n < 400]
     assert playback.comparison.same
     (gap,) = playback.gaps
     assert gap.steps == 200
-    assert gap.begin == tape.taken[199].now
-    assert gap.end == tape.taken[400].now
+    assert gap.begin == TAPE.taken[199].now
+    assert gap.end == TAPE.taken[400].now
     assert len(recording.damage) == 1
 
 
-def test_two_files_of_a_run_are_one_drive(tape: Tape, tmp_path: Path) -> None:
-    paths = tape.save(tmp_path / "1", end=400), tape.save(tmp_path / "2", first=400)
+def test_two_files_of_a_run_are_one_drive(tmp_path: Path) -> None:
+    paths = TAPE.save(tmp_path / "1", end=400), TAPE.save(tmp_path / "2", first=400)
     numbers, playback, _ = played(*paths)
-    assert numbers == list(range(len(tape.taken)))
+    assert numbers == list(range(len(TAPE.taken)))
     assert playback.comparison.same
     assert playback.gaps == []
 
 
-def test_a_missing_file_is_a_gap_and_another_run_is_none(tape: Tape, tmp_path: Path) -> None:
-    paths = tape.save(tmp_path / "1", end=200), tape.save(tmp_path / "2", first=400)
+def test_a_missing_file_is_a_gap_and_another_run_is_none(tmp_path: Path) -> None:
+    paths = TAPE.save(tmp_path / "1", end=200), TAPE.save(tmp_path / "2", first=400)
     _, playback, _ = played(*paths)
     assert [gap.steps for gap in playback.gaps] == [200]
     with (tmp_path / "3").open("wb") as file:
         FrameWriter(file).begin(Head("0.2.0", "acsar", 0, 0, 0, "", b"", started_ns=7))
-    _, playback, _ = played(tape.save(tmp_path / "1", end=200), tmp_path / "3")
+    _, playback, _ = played(TAPE.save(tmp_path / "1", end=200), tmp_path / "3")
     assert playback.gaps == []
 
 
-def test_another_configuration_changes_the_lines(tape: Tape, tmp_path: Path) -> None:
-    config = Config()
+def test_another_configuration_changes_the_lines(tmp_path: Path) -> None:
+    config = CONFIG
     slow = replace(config, limits=replace(config.limits, linear_speed=0.2))
     for first in (0, 400):
-        _, playback, _ = played(tape.save(tmp_path / "a", first=first), other=slow)
+        _, playback, _ = played(TAPE.save(tmp_path / "a", first=first), other=slow)
         assert "line" in playback.comparison.first_by_output
         assert playback.robot.config == slow
 
 
-def test_steps_outside_the_time_are_told_apart(tape: Tape, tmp_path: Path) -> None:
-    path = tape.save(tmp_path / "a")
-    times = tape.taken[450].now.wall_ns, tape.taken[460].now.wall_ns
+def test_steps_outside_the_time_are_told_apart(tmp_path: Path) -> None:
+    path = TAPE.save(tmp_path / "a")
+    times = TAPE.taken[450].now.wall_ns, TAPE.taken[460].now.wall_ns
     recording = Recording([path], *times)
     playback = Playback(recording)
     numbers = [s.number for s, _ in playback.steps() if recording.contains(s.now)]
-    assert numbers == list(range(450, 461))
+    assert numbers == [n for n, s in enumerate(TAPE.taken) if times[0] <= s.now.wall_ns <= times[1]]
     assert playback.comparison.steps == 200
     assert playback.comparison.same
 
@@ -109,10 +100,10 @@ def test_a_state_that_this_version_cannot_use_is_refused_in_words(tmp_path: Path
         played(path)
 
 
-def test_forged_numbers_give_an_error_in_words(tape: Tape, tmp_path: Path) -> None:
+def test_forged_numbers_give_an_error_in_words(tmp_path: Path) -> None:
     forged = Tape()
     bad = Command("app", Twist(float("nan"), 0.0), -(1 << 62))
-    for n, entry in enumerate(tape.taken[:20]):
+    for n, entry in enumerate(TAPE.taken[:20]):
         now = Instant((-1) ** n * (1 << 61 - n), 1 << 62 - n)
         heard = replace(entry.heard, commands=(bad,), missed=1 << 62)
         forged.taken.append(entry._replace(now=now, heard=heard, late_ns=-(1 << 62)))
@@ -128,15 +119,15 @@ class BrokenError(Exception):
 
 
 def test_the_step_in_which_the_daemon_failed_is_replayed_too(
-    tape: Tape, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    path = tape.save(tmp_path / "a", end=200)
+    path = TAPE.save(tmp_path / "a", end=200)
     with path.open("ab") as file:
         frames = FrameWriter(file)
-        at, state = tape.taken[200].now, tape.states[200]
+        at, state = TAPE.taken[200].now, TAPE.states[200]
         started_ns = START.wall_ns
         frames.begin(Head("0.2.0", "acsar", 200, at.mono_ns, at.wall_ns, "", state, started_ns))
-        failed = tape.taken[200]
+        failed = TAPE.taken[200]
         frames.add(Failure(200, "BrokenError: x", failed.now, failed.heard))
         frames.end()
     _, playback, _ = played(path)
@@ -150,12 +141,31 @@ def test_the_step_in_which_the_daemon_failed_is_replayed_too(
     assert "also fails here, with BrokenError: y" in playback.failed_step()
 
 
-def test_a_difference_names_the_side_without_a_pose(tape: Tape, tmp_path: Path) -> None:
-    config = Config()
+def test_a_difference_names_the_side_without_a_pose(tmp_path: Path) -> None:
+    config = CONFIG
     checked = replace(config, mcu=replace(config.mcu, link_check="on"))
-    _, playback, _ = played(tape.save(tmp_path / "a"), other=checked)
+    _, playback, _ = played(TAPE.save(tmp_path / "a"), other=checked)
     first = playback.comparison.first_by_output["pose"]
     recorded, replayed = "\n".join(describe_difference(first, 0)).split("  replayed")
     assert "pose x 0.000000" in recorded
     assert "no pose" in replayed
     assert "no pose" not in recorded
+
+
+# the estimates are stored rounded, with a checksum of the exact ones
+
+ESTIMATES = [estimate for step in TAPE.taken for estimate in step.news.estimates]
+
+
+def test_poses_are_rounded_to_millionths() -> None:
+    turned = replace(ESTIMATES[0], pose=Pose(1.0000004, -2.0000006, 3.1415926))
+    assert micropose(turned) == (1_000_000, -2_000_001, 3_141_593)
+
+
+def test_a_checksum_continues_and_covers_every_bit() -> None:
+    *early, last = ESTIMATES
+    assert checksum(ESTIMATES[5:], checksum(ESTIMATES[:5], 0)) == checksum(ESTIMATES, 0)
+    nudged = replace(last, pose=replace(last.pose, x=math.nextafter(last.pose.x, 9.0)))
+    turned = replace(last, positions=(0.0, *last.positions[1:]))
+    for other in (nudged, turned):
+        assert checksum([*early, other], 0) != checksum(ESTIMATES, 0)

@@ -1,18 +1,29 @@
-"""Tests of a recording's timeline in sentences."""
+"""The timeline of a recording, and the messages that its replayed robot publishes.
+
+`scenarios/test_export.py` proves that they equal the original messages.
+"""
 
 from __future__ import annotations
 
+import tempfile
+from functools import cache
 from pathlib import Path
 from typing import Any
 
 import pytest
 from msgspec.structs import replace
 
+from acsard.core.config.parsing import effective
 from acsard.core.config.settings import Config, McuConfig
-from acsard.recording.file import Failure, Head, ReadRecord, Recording, Waits
+from acsard.core.config.toml_text import document
+from acsard.core.ros.shapes import Log
+from acsard.core.values import NS_PER_S
+from acsard.recording.file import Failure, FrameWriter, Head, ReadRecord, Recording, Waits
+from acsard.recording.published import Published, published
 from acsard.recording.timeline import Timeline, TimelineEntry
 from tests.scenarios.taped import Tape, recorded_world
 from tests.scenarios.world import START
+from tests.unit.drives import CONFIG, drive
 
 BOARD = Config(mcu=McuConfig(port="/dev/ttyACM0"))
 
@@ -30,20 +41,12 @@ def story(tape: Tape, without: range = range(0)) -> list[TimelineEntry]:
     return entries_of(head(), *[step for step in tape.steps() if step.number not in without])
 
 
-def driven() -> Tape:
-    tape, world = recorded_world()
-    world.drive(0.5, seconds=2.0)
-    world.call("stop")
-    world.run(0.5)
-    return tape
-
-
 def texts(entries: list[TimelineEntry], name: str) -> list[str]:
     return [entry.sentence for entry in entries if entry.name == name]
 
 
 def test_each_event_has_an_entry_with_its_time_its_level_and_its_client() -> None:
-    tape = driven()
+    tape = drive()
     events = [(step.now.wall_ns, e) for step in tape.taken for e in step.news.events]
     first, *entries = story(tape)
     assert (first.name, first.wall_ns) == ("start", START.wall_ns)
@@ -57,13 +60,13 @@ def test_each_event_has_an_entry_with_its_time_its_level_and_its_client() -> Non
 
 
 def test_missing_steps_are_reported() -> None:
-    (gap,) = [entry for entry in story(driven(), range(100, 200)) if entry.name == "gap"]
+    (gap,) = [entry for entry in story(drive(), range(100, 200)) if entry.name == "gap"]
     assert gap.text.startswith("100 steps are missing before this step (")
     assert gap.level == "warning"
 
 
 def test_a_recording_that_continues_another_begins_with_what_the_robot_does() -> None:
-    steps = driven().steps()
+    steps = drive().steps()
     entry, *others = entries_of(head(150), *steps[150:])
     assert entry.name == "continues"
     assert entry.wall_ns == steps[150].now.wall_ns
@@ -84,7 +87,7 @@ def test_a_clock_that_is_set_and_a_suspended_computer_are_reported() -> None:
 
 
 def test_a_run_that_ends_without_a_shutdown_is_reported_before_the_next_start() -> None:
-    steps = driven().steps()
+    steps = drive().steps()
     entries = entries_of(head(), *steps, head(started_ns=1), *steps)
     names = [entry.name for entry in entries]
     cut = names.index("cut")
@@ -104,7 +107,7 @@ def test_a_run_that_ends_with_its_shutdown_was_not_cut() -> None:
 
 
 def test_a_failure_of_the_daemon_is_reported() -> None:
-    steps = driven().steps()
+    steps = drive().steps()
     last = entries_of(head(), *steps, Failure(len(steps), "ValueError: seven"))[-1]
     assert (last.name, last.level) == ("failure", "error")
     assert last.text == "the daemon failed: ValueError: seven"
@@ -135,7 +138,7 @@ def test_a_new_reason_of_the_same_mode_has_an_entry_with_its_source() -> None:
 
 def test_reasons_that_alternate_in_every_step_make_an_entry_a_second() -> None:
     steps = []
-    for step in driven().steps()[:201]:
+    for step in drive().steps()[:201]:
         code: Any = f"code{step.number % 2}"
         words = {"code": code, "reason": f"reason {step.number}"}
         status = replace(step.recorded.status, mode="ready", **words)
@@ -155,7 +158,7 @@ def test_a_link_that_is_lost_has_the_reason_of_its_event_only() -> None:
 
 
 def test_a_source_that_waits_has_an_entry_once_in_a_drive() -> None:
-    steps = driven().steps()
+    steps = drive().steps()
     waits = Waits(steps[100].now, {"nav": ("source_priority", "app has priority")})
     other = Waits(steps[150].now, {"nav": ("source_first", "app came first")})
     entries = entries_of(head(), *steps[:100], waits, *steps[100:150], waits, other)
@@ -164,7 +167,90 @@ def test_a_source_that_waits_has_an_entry_once_in_a_drive() -> None:
     assert texts(again, "waits") == ["app has priority (by nav)"] * 2
 
 
-def test_the_records_of_a_file_have_the_same_entries(tmp_path: Path) -> None:
-    tape = driven()
-    recording = Recording([tape.save(tmp_path / "a.rec.zst")])
-    assert entries_of(*recording.records()) == story(tape)
+# the messages
+
+
+@cache
+def messages(config: Config = CONFIG) -> list[Published]:
+    """Return the messages of the drive by a robot with this configuration."""
+    with tempfile.TemporaryDirectory() as place:
+        return list(published(Recording([drive().save(Path(place) / "a.rec.zst")]), config))
+
+
+def names(published: list[Published]) -> set[str]:
+    return {message.channel.name for message in published}
+
+
+def test_a_transform_that_is_switched_off_is_not_published() -> None:
+    quiet = replace(
+        CONFIG,
+        odometry=replace(CONFIG.odometry, publish_tf=False),
+        lidar=replace(CONFIG.lidar, publish_tf=False),
+    )
+    assert names(messages()) - names(messages(quiet)) == {
+        "tf",
+        "tf_static",
+    }
+
+
+def test_other_parameters_change_the_pose_but_not_the_received_commands() -> None:
+    wider = replace(CONFIG, drive=replace(CONFIG.drive, wheel_separation=0.6))
+    then, now = messages(), messages(wider)
+    (last, other) = ([m for m in run if m.channel.name == "odom"][-1] for run in (then, now))
+    turned, less = (m.message.pose.pose.orientation.z for m in (last, other))
+    assert 0.3 < less / turned < 0.7
+    commands = [[m for m in run if m.channel.name.startswith("cmd_vel_in")] for run in (then, now)]
+    assert commands[0] == commands[1] != []
+
+
+def logs(messages: list[Published]) -> list[Log]:
+    return [m.message for m in messages if isinstance(m.message, Log)]
+
+
+def test_the_log_has_the_same_lines_as_the_timeline(tmp_path: Path) -> None:
+    recording, timeline = Recording([drive().save(tmp_path / "a.rec.zst")]), Timeline()
+    entries = [entry for record in recording.records() for entry in timeline.take(record)]
+    lines = logs(list(published(recording)))
+    assert [line.name for line in lines] == [entry.name for entry in entries]
+    assert [line.msg for line in lines] == [entry.sentence for entry in entries]
+    assert [line.stamp.to_ns() for line in lines] == [entry.wall_ns for entry in entries]
+    assert "start" in [line.name for line in lines]
+
+
+def test_two_runs_of_the_daemon_are_published_one_after_the_other(tmp_path: Path) -> None:
+    path = drive().save(tmp_path / "a.rec.zst")
+    once, twice = (list(published(Recording([path] * n))) for n in (1, 2))
+    # A restarted robot begins at the origin of `odom` again.
+    odom, both = ([m for m in run if m.channel.name == "odom"] for run in (once, twice))
+    assert both == odom * 2
+    assert [line.name for line in logs(twice)].count("start") == 2
+
+
+def test_what_sources_waited_for_before_a_part_is_not_in_its_log(tmp_path: Path) -> None:
+    tape, path = drive(), tmp_path / "a.rec.zst"
+    steps = tape.taken
+    start, middle = steps[0].now, steps[len(steps) // 2].now
+    with path.open("wb") as file:
+        frames = FrameWriter(file)
+        text = "\n".join(document(effective(Config()))) + "\n"
+        frames.begin(Head("0.2.0", "acsar", 0, start.mono_ns, start.wall_ns, text))
+        frames.add(Waits(start, {"nav": ("higher", "early")}))
+        frames.add(Waits(middle, {"nav": ("equal", "late")}))
+    part = published(Recording([path], START.wall_ns + 1))
+    assert [line.msg for line in logs(list(part))] == ["late (by nav)"]
+
+
+def test_a_part_has_the_messages_of_its_time_and_says_what_it_continues(tmp_path: Path) -> None:
+    path, begin_ns = drive().save(tmp_path / "a.rec.zst"), START.wall_ns + NS_PER_S // 2
+    part = list(published(Recording([path], begin_ns)))
+    whole = list(published(Recording([path])))
+    first, *rest = logs(part)
+    assert (first.name, first.msg) == (
+        "continues",
+        "the robot is driving (commanded by app), link up (by app)",
+    )
+    assert min(m.wall_ns for m in part) >= begin_ns - 10_000_000
+    steady = {"odom", "cmd_vel_out", "state", "joint_states"}
+    inside = [m for m in whole if m.wall_ns >= begin_ns and m.channel.name in steady]
+    assert [m for m in part if m.channel.name in steady] == inside
+    assert rest == [line for line in logs(whole) if line.stamp.to_ns() >= begin_ns]

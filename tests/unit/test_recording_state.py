@@ -9,6 +9,7 @@ import random
 import re
 import time
 from collections.abc import Callable
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -34,42 +35,46 @@ from acsard.recording.state import (
     thaw,
 )
 from tests.each import each
-from tests.scenarios.taped import Tape
+from tests.scenarios.taped import BATCH, Tape
 from tests.scenarios.world import World
+from tests.unit.drives import drive
+
+PLAIN = Config()
+
+# Every error of the odometry is estimated.
+ERRORS = replace(
+    PLAIN.odometry, gyro=True, wheel_separation_multiplier_std=0.01, wheel_radius_ratio_std=0.01,
+    distance_scale_std=0.01,
+)  # fmt: skip
 
 
-def test_a_robot_is_read_back_unchanged() -> None:
-    world = World()
+@cache
+def driven(config: Config = PLAIN) -> bytes:
+    """Return the state of a robot that drives."""
+    world = World(config)
     world.drive(0.5, 0.3, seconds=2.0)
-    memory = world.loop._guard.memory
+    return freeze(world.loop.robot, world.loop._guard.memory)
+
+
+@pytest.mark.parametrize("config", [PLAIN, replace(PLAIN, odometry=ERRORS)])
+def test_a_robot_is_read_back_unchanged(config: Config) -> None:
+    world = World(config)
+    world.drive(0.5, 0.3, seconds=2.0)
+    robot, memory = world.loop.robot, world.loop._guard.memory
     assert memory.commanded_ns is not None
-    state = thaw(freeze(world.loop.robot, memory))
+    data = freeze(robot, memory)
+    state = thaw(data)
     assert state.memory == memory
-    assert state.robot.snapshot(world.now_ns) == world.loop.robot.snapshot(world.now_ns)
-    again = freeze(state.robot, Memory())
-    assert freeze(thaw(again).robot, Memory()) == again
+    assert state.robot.snapshot(world.now_ns) == robot.snapshot(world.now_ns)
+    assert freeze(*state) == freeze(*thaw(data, config)) == data
+    errors = [column for column in state.robot._odometry.uncertainty.columns if any(column)]
+    assert len(errors) >= 3 or config == PLAIN
 
 
-def test_a_robot_with_every_odometry_error_is_read_back() -> None:
-    odometry = replace(
-        Config().odometry, gyro=True, wheel_separation_multiplier_std=0.01,
-        wheel_radius_ratio_std=0.01, distance_scale_std=0.01,
-    )  # fmt: skip
-    world = World(replace(Config(), odometry=odometry))
-    world.drive(0.5, 0.3, seconds=2.0)
-    data = freeze(world.loop.robot, Memory())
-    columns = thaw(data).robot._odometry.uncertainty.columns
-    assert len([column for column in columns if any(column)]) >= 3
-    assert freeze(*thaw(data)) == freeze(*thaw(freeze(*thaw(data))))
-
-
-def test_damaged_bytes_are_refused_with_a_message(tmp_path: Path) -> None:
-    data = freeze(World().loop.robot, Memory())
-    with pytest.raises(StateError, match="this version"):
-        thaw(data[:1000])
+@pytest.mark.parametrize("end", [0, 1000])
+def test_a_state_that_was_cut_is_refused(end: int) -> None:
     with pytest.raises(StateError):
-        thaw(b"")
-    assert isinstance(thaw(data).robot, Robot)
+        thaw(driven()[:end])
 
 
 @each(
@@ -86,7 +91,7 @@ def test_damaged_bytes_are_refused_with_a_message(tmp_path: Path) -> None:
 )
 @each("part", [*PARTS, None])
 def test_a_forged_part_is_refused_at_once(part: str | None, state: bytes) -> None:
-    frozen = msgspec.msgpack.decode(freeze(Robot(PLAIN), Memory()), type=Frozen)
+    frozen = msgspec.msgpack.decode(driven(), type=Frozen)
     if part is not None:
         frozen.parts[part] = msgspec.Raw(state)
         state = msgspec.msgpack.encode(frozen)
@@ -98,7 +103,7 @@ def test_a_forged_part_is_refused_at_once(part: str | None, state: bytes) -> Non
 
 def test_a_state_above_a_megabyte_is_refused_unread() -> None:
     with pytest.raises(StateError, match="bytes: the file is damaged or forged"):
-        thaw(freeze(Robot(PLAIN), Memory()) + bytes(MAX_BYTES))
+        thaw(driven() + bytes(MAX_BYTES))
 
 
 @pytest.mark.slow
@@ -108,7 +113,7 @@ def test_with_any_bit_flipped_the_bytes_are_a_robot_or_refused() -> None:
     Half of them are names of fields. A field whose name is damaged has its default, and most others
     have a wrong number.
     """
-    data, dice, refused = freeze(World().loop.robot, Memory()), random.Random(1), list[str]()
+    data, dice, refused = driven(), random.Random(1), list[str]()
     for _ in range(60):
         bad = bytearray(data)
         bad[dice.randrange(len(bad))] ^= 1 << dice.randrange(8)
@@ -118,13 +123,6 @@ def test_with_any_bit_flipped_the_bytes_are_a_robot_or_refused() -> None:
             refused.append(str(error))
     assert 5 < len(refused) < 30
     assert all(words.isprintable() for words in refused)
-
-
-def played(recording: Recording) -> Playback:
-    playback = Playback(recording)
-    for _ in playback.steps():
-        pass
-    return playback
 
 
 def structs(kind: inspect.Type, found: set[type[Struct]]) -> set[type[Struct]]:
@@ -157,20 +155,20 @@ def test_each_attribute_of_a_robot_is_recorded_or_follows_from_the_configuration
     [("_tally", {"free_ns": {"stop": "soon"}}), ("_tally", 5), ("_tally", [{}, 0, {}])],
 )
 def test_a_part_with_a_value_of_another_type_is_refused(part: str, value: object) -> None:
-    frozen = msgspec.msgpack.decode(freeze(Robot(Config()), Memory()))
+    frozen = msgspec.msgpack.decode(driven())
     frozen["parts"][part] = value
     with pytest.raises(StateError, match="Expected"):
         thaw(msgspec.msgpack.encode(frozen))
 
 
 def test_what_a_part_of_an_older_version_lacks_has_its_default() -> None:
-    frozen = msgspec.msgpack.decode(freeze(driven(), Memory()))
+    frozen = msgspec.msgpack.decode(driven())
     assert frozen["parts"]["_tally"].pop("free_ns")
     assert thaw(msgspec.msgpack.encode(frozen)).robot._tally.free_ns == {}
 
 
 def test_a_state_with_a_configuration_that_a_file_may_not_have_is_refused() -> None:
-    robot = Robot(Config())
+    robot = Robot(PLAIN)
     robot.config = replace(PLAIN, limits=replace(PLAIN.limits, linear_deceleration=0.11))
     with pytest.raises(StateError, match=r"limits\.linear_deceleration = 0\.11"):
         thaw(freeze(robot, Memory()))
@@ -186,44 +184,15 @@ SPOILERS: dict[str, Callable[[Robot], None]] = {
 }
 
 
-@pytest.fixture(scope="module")
-def taped() -> Tape:
-    tape = Tape(every=100)
-    World(recorder=tape).drive(0.5, seconds=1.0)
-    return tape
-
-
 @pytest.mark.parametrize("how", SPOILERS)
-def test_a_robot_with_a_wrong_part_is_refused_with_a_message(
-    how: str, taped: Tape, tmp_path: Path
-) -> None:
-    robot, memory = thaw(taped.states[100])
+def test_a_robot_with_a_wrong_part_is_refused_with_a_message(how: str, tmp_path: Path) -> None:
+    tape, first = Tape(), BATCH
+    robot, memory = thaw(drive().states[first])
     SPOILERS[how](robot)
-    spoilt = replace_state(taped, freeze(robot, memory))
-    path = spoilt.save(tmp_path / "spoilt", first=100)
+    tape.taken, tape.states = drive().taken, {first: freeze(robot, memory)}
+    path = tape.save(tmp_path / "spoilt", first=first)
     with pytest.raises(RecordingError, match=r"this acsard cannot replay spoilt, which acsard "):
-        played(Recording([path]))
-
-
-def replace_state(tape: Tape, state: bytes) -> Tape:
-    """Return the recording of the same drive with this robot as its first state."""
-    other = Tape()
-    other.taken, other.states = tape.taken, {100: state}
-    return other
-
-
-PLAIN = Config()
-
-
-def driven() -> Robot:
-    world = World()
-    world.drive(0.5, 0.2, seconds=2.0)
-    return world.loop.robot
-
-
-def test_the_same_configuration_changes_nothing() -> None:
-    before = freeze(driven(), Memory())
-    assert freeze(*thaw(before, PLAIN)) == freeze(*thaw(before)) == before
+        list(Playback(Recording([path])).steps())
 
 
 def test_configured_values_change_and_values_of_the_drive_stay() -> None:
@@ -232,8 +201,8 @@ def test_configured_values_change_and_values_of_the_drive_stay() -> None:
         drive=replace(PLAIN.drive, wheel_radius=0.1),
         limits=replace(PLAIN.limits, linear_speed=0.25),
     )
-    before = driven()
-    robot = thaw(freeze(before, Memory()), other).robot
+    before = thaw(driven()).robot
+    robot = thaw(driven(), other).robot
     assert robot.snapshot(0).pose == before.snapshot(0).pose
     assert robot.counters == before.counters
     assert robot.session.link == "up"
