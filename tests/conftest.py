@@ -10,8 +10,9 @@ import shutil
 import signal
 import sys
 import tempfile
+import time
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Generator
 from pathlib import Path
 from zlib import crc32
 
@@ -58,6 +59,14 @@ LIVE = ("bench", "firmware", "system", "systemd")
 
 VARIATIONS_PER_CI_TEST = 10
 """`.ci/run` runs about one in this many slow variations. The nightly job runs the others."""
+
+LONGEST_S = 4.0
+"""Processor time of this process in which a test without one of these marks must end.
+
+A second is the aim: of 5,400 such tests 20 took 1.0 to 2.7 s on a machine with a load of 17.
+"""
+
+MARKS = {"slow", "soak", "bench", "network", "systemd", "firmware", "languages", "bridge"}
 
 LOUD = (
     "test_board.py", "test_bus.py", "test_daemon.py", "test_faults.py", "test_faults_bus.py",
@@ -173,6 +182,21 @@ def pytest_pyfunc_call(pyfuncitem: pytest.Function) -> bool | None:
         return None
     run(test(**{name: pyfuncitem.funcargs[name] for name in names}))
     return True
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_call(item: pytest.Item) -> Generator[None, object, object]:
+    """Fail a test without a mark that computes for too long.
+
+    Coverage, and the other profiles of hypothesis, may take longer.
+    """
+    began = time.process_time()
+    result = yield
+    took = time.process_time() - began
+    usual = settings().max_examples <= 10 and "coverage" not in sys.modules
+    if took > LONGEST_S and usual and not MARKS & {mark.name for mark in item.iter_markers()}:
+        pytest.fail(f"{took:.1f} s of processor time: make it smaller, or mark it `slow`")
+    return result
 
 
 def pytest_collection_finish() -> None:
