@@ -37,19 +37,15 @@ def certificates(tls: str) -> Iterator[Finding]:
     if not tls:
         return
     directory = Path(tls)
-    for name in (CA, CERTIFICATE, KEY):
-        file = directory / name
-        if not (os.path.isfile(file) and os.access(file, os.R_OK)):
-            text = f"{file} is missing or is not a file, or you have no permission to read it"
-            yield Finding("certificates", "failure", text, _mend_of_absent(directory))
-            if os.path.exists(file) and not os.path.isfile(file):
-                return  # reading it might never end
-        elif name == KEY and file.stat().st_mode & 0o077:
-            text, mend = (
-                f"users other than the owner can read the private key {file}",
-                f"chmod 600 {shlex.quote(str(file))}",
-            )
-            yield Finding("certificates", "failure", text, mend)
+    for file in files_in(tls):
+        if os.path.exists(file) and not os.path.isfile(file):  # reading it might never end
+            mend = _mend_of_absent(directory)
+            yield Finding("certificates", "failure", f"{file} is not a file", mend)
+            return
+    key = directory / KEY
+    if os.path.isfile(key) and key.stat().st_mode & 0o077:
+        text = f"users other than the owner can read the private key {key}"
+        yield Finding("certificates", "failure", text, f"chmod 600 {shlex.quote(str(key))}")
     try:
         require_usable(tls)
     except MendableError as error:
@@ -64,7 +60,8 @@ def certificates(tls: str) -> Iterator[Finding]:
             f"{directory / CA} has not signed {directory / CERTIFICATE}: clients that trust only "
             "this authority refuse this machine"
         )
-        yield Finding("certificates", "warning", text, renewal(tls, ""))
+        mend = f"copy {CA}, {CERTIFICATE} and {KEY} again from the machine that has {CA_KEY}"
+        yield Finding("certificates", "warning", text, mend)
         return
     expiries = expiry_times(tls)
     code, words = expiry(expiries, now().wall_ns)

@@ -6,7 +6,7 @@ import os
 import re
 import shlex
 import shutil
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -14,14 +14,14 @@ import pytest
 from cryptography.hazmat.primitives.asymmetric import ec
 
 from acsard.bus import certificate_watch
-from acsard.bus.tls import AUTHORITY, expiry_times, require_usable
+from acsard.bus.tls import expiry_times, require_usable
 from acsard.cli import main
 from acsard.core.config.settings import BusConfig, Config
 from acsard.core.values import NS_PER_S
 from acsard.host import clock
 from acsard.host.errors import NotPermittedError
 from acsard.machine.authority import Authority
-from acsard.machine.certificate_findings import certificates, renewal, router_certificates
+from acsard.machine.certificate_findings import certificates, router_certificates
 from acsard.machine.finding import Finding
 
 DAY_NS = 86400 * NS_PER_S
@@ -56,11 +56,6 @@ def typed(mend: str, where: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert main(shlex.split(command)) == 0
 
 
-def test_sound_certificates_need_no_advice(fleet: Path) -> None:
-    expected = Finding("certificates", "ok", f"{fleet}: valid for 730 days")
-    assert finding(fleet) == expected
-
-
 def test_the_advised_command_renews_the_robots_own_certificate(
     fleet: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -83,12 +78,6 @@ def test_the_advised_command_replaces_a_key_that_only_zenoh_refuses(
     assert f"the key {fleet}/key.pem (failed to parse private key" in result.text
     typed(result.mend, fleet, monkeypatch)
     assert finding(fleet).level == "ok"
-
-
-def test_without_the_authoritys_key_the_advice_asks_for_it(fleet: Path) -> None:
-    Authority.load(fleet, str).issue(fleet, "robot", ["localhost"], 9.9)
-    (fleet / "ca-key.pem").unlink()
-    assert finding(fleet).mend.endswith(", after you have copied ca-key.pem into that directory")
 
 
 @pytest.mark.parametrize("days", [9.9, -3.0])
@@ -123,28 +112,6 @@ def test_the_advice_about_an_authority_makes_a_new_one(
     assert finding(directory).level == "ok"
 
 
-def test_the_advice_about_a_router_names_its_certificate(fleet: Path) -> None:
-    advice = renewal(str(fleet / "clients" / "robot4"), "the router tls/router.local:7447")
-    assert "`acsard tls renew --name router.local --directory .`" in advice
-    assert advice.endswith("then copy clients/router.local/*.pem from there to the router")
-    assert "init --force" in renewal(str(fleet), AUTHORITY)
-
-
-def test_an_expiring_certificate_of_a_router_is_a_finding(
-    fleet: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    end_ns = clock.now().wall_ns + 9 * DAY_NS
-    ends_ns = {"tls/router.local:7447": end_ns, "tls/away.local:7447": None}
-    monkeypatch.setattr(certificate_watch, "peer_ends_ns", lambda endpoint, tls: ends_ns[endpoint])
-    bus = BusConfig(
-        mode="client", connect=("tcp/127.0.0.1:7447", *ends_ns), tls=str(fleet / "clients/robot4")
-    )
-    (result,) = router_certificates(Config(bus=bus))
-    assert (result.subject, result.level) == ("router", "warning")
-    assert result.text == "expires in 9 days (certificate of the router tls/router.local:7447)"
-    assert "--name router.local" in result.mend
-
-
 def test_the_advised_command_makes_the_first_certificate_of_an_empty_directory(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -162,16 +129,6 @@ def test_the_advised_command_replaces_a_missing_key_beside_the_authoritys_key(
     (fleet / "key.pem").unlink()
     typed(next(iter(certificates(str(fleet)))).mend, fleet, monkeypatch)
     assert finding(fleet).level == "ok"
-
-
-def test_for_a_missing_key_of_a_fleet_robot_no_new_authority_is_advised(fleet: Path) -> None:
-    own = fleet / "clients" / "robot4"
-    (own / "key.pem").unlink()
-    for result in certificates(str(own)):
-        assert "tls init" not in result.mend
-        assert (
-            "copy ca.pem, certificate.pem and key.pem from there into this directory" in result.mend
-        )
 
 
 @pytest.mark.skipif(os.geteuid() == 0, reason="root may write everywhere")
@@ -212,20 +169,54 @@ def test_for_a_directory_that_this_user_may_not_look_into_sudo_is_advised(
             directory.chmod(0o700)
 
 
-def test_for_a_key_that_other_users_can_read_chmod_is_advised(fleet: Path) -> None:
-    (fleet / "key.pem").chmod(0o644)
-    (result, _) = certificates(str(fleet))
-    assert result.mend == f"chmod 600 {fleet}/key.pem"
+def expiring(fleet: Path) -> None:
+    Authority.load(fleet, str).issue(fleet, "robot", ["localhost"], 9.9)
+    (fleet / "ca-key.pem").unlink()
 
 
-def test_the_certificate_of_another_authority_is_reported(fleet: Path, tmp_path: Path) -> None:
-    Authority.make(tmp_path / "other", "other", 30, ["localhost"])
-    (fleet / "ca.pem").write_bytes((tmp_path / "other" / "ca.pem").read_bytes())
-    result = finding(fleet)
-    assert (result.level, "has not signed" in result.text) == ("warning", True)
+def other_authority(fleet: Path) -> None:
+    Authority.make(fleet / "other", "other", 30, ["localhost"])
+    (fleet / "ca.pem").write_bytes((fleet / "other" / "ca.pem").read_bytes())
 
 
-def test_a_key_that_is_not_a_file_is_not_read(fleet: Path) -> None:
+def pipe(fleet: Path) -> None:
     (fleet / "key.pem").unlink()
     os.mkfifo(fleet / "key.pem")
-    assert "is not a file" in finding(fleet).text
+
+
+SPOILED: dict[str, Callable[[Path], object]] = {
+    "sound certificates": lambda fleet: None,
+    "they expire soon, and the authority's key is elsewhere": expiring,
+    "users other than the owner can read the key": lambda fleet: (fleet / "key.pem").chmod(0o644),
+    "the certificate of another authority": other_authority,
+    "a key that is no file": pipe,
+    "no key beside the authority's": lambda fleet: (fleet / "key.pem").unlink(),
+    "a robot of a fleet without its key": lambda fleet: (fleet / "clients/robot4/key.pem").unlink(),
+    "no directory": shutil.rmtree,
+}
+
+
+def test_each_finding_about_certificates_has_the_approved_words(
+    fleet: Path, monkeypatch: pytest.MonkeyPatch, approved: Callable[[Path, str], None]
+) -> None:
+    lines = list[str]()
+
+    def add(what: str, findings: Iterable[Finding]) -> None:
+        lines.append(f"--- {what}")
+        for one in findings:
+            lines.append(f"{one.level}: {one.subject}: {one.text}")
+            lines.extend([f"    -> {one.mend}"] if one.mend else [])
+
+    for what, spoil in SPOILED.items():
+        place = fleet.parent / "tls"
+        shutil.copytree(fleet, place)
+        spoil(place)
+        own = "robot4" in what or "fleet" in what
+        add(what, certificates(str(place / "clients/robot4" if own else place)))
+        shutil.rmtree(place, ignore_errors=True)
+    ends_ns = {"tls/router.local:7447": clock.now().wall_ns + 9 * DAY_NS, "tls/away:7447": None}
+    monkeypatch.setattr(certificate_watch, "peer_ends_ns", lambda endpoint, tls: ends_ns[endpoint])
+    bus = BusConfig(mode="client", connect=("tcp/127.0.0.1:1", *ends_ns), tls=str(fleet))
+    add("the certificate of a router expires soon", router_certificates(Config(bus=bus)))
+    text = "\n".join(lines).replace(str(fleet.parent), "HERE") + "\n"
+    approved(Path(__file__).with_name("words") / "doctor_certificates.txt", text)
