@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import subprocess
 import sys
+from collections.abc import Callable, Iterator
 from contextlib import nullcontext
 from pathlib import Path
 from types import SimpleNamespace
@@ -16,6 +17,7 @@ from acsard.cli import connection, foxglove, main, move, parser
 from acsard.cli.connection import Silence
 from acsard.cli.move import _parsed
 from acsard.client.follower import FIRST_STATE_TIMEOUT_S
+from acsard.core.config.named_faults import ARGUMENTS
 from acsard.core.values import Pose
 from acsard.host import errors
 from acsard.host.errors import (
@@ -69,6 +71,29 @@ def test_the_help_names_every_code(capsys: pytest.CaptureFixture[str]) -> None:
     assert all(f" {int(code)} " in output for code in Exit)
     assert all(f"{code} {words}" in " ".join(output.split()) for code, words in EXIT_TEXTS.items())
     assert set(EXIT_TEXTS) == set(Exit)
+
+
+def helped(known: argparse.ArgumentParser, path: str) -> Iterator[str]:
+    """Yield the words of a help page and of those below, without the layout."""
+    yield f"--- {path}"
+    yield from filter(None, (known.description, known.epilog))
+    for action in known._actions:
+        if isinstance(action, argparse._SubParsersAction):
+            for name, below in action.choices.items():
+                yield from helped(below, f"{path} {name}")
+        elif action.help not in ("show this help message and exit", argparse.SUPPRESS):
+            names = ", ".join(action.option_strings) or str(action.metavar or action.dest)
+            yield f"{names}: {action.help}"
+
+
+def test_the_help_pages_have_the_approved_words(approved: Callable[[Path, str], None]) -> None:
+    text = "\n".join(line.rstrip() for line in helped(parser(), "acsard")) + "\n"
+    approved(Path(__file__).with_name("words") / "help.txt", text)
+    # Each argument of a fault is explained.
+    named = [word.rstrip(",;") for word in text.partition("--- acsard sim\n")[2].split()]
+    for name, kinds in ARGUMENTS.items():
+        (word,) = [word for word in named if word.startswith(f"{name}=")]
+        assert len(word.partition("=")[2].split(":")) == len(kinds)
 
 
 @each("code", list(Exit))

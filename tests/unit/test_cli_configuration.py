@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import os
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import msgspec
@@ -21,6 +22,7 @@ from acsard.core.config.settings import Config, McuConfig, WebConfig
 from acsard.host import config_file
 from acsard.host.config_file import SEARCH_PATHS, find, writable
 from acsard.host.errors import Exit, MendableError, UnreachableError, UsageError
+from acsard.host.version import version
 from acsard.machine.doctor import OPTION_KEYS
 from tests.each import each
 
@@ -310,41 +312,22 @@ def test_one_option_changes_its_own_table_only(words: list[str], table: str) -> 
     assert changed == [table]
 
 
-def test_the_banner_distinguishes_a_simulator_from_a_robot() -> None:
-    simulated = run.banner(Config(), "acsard.toml", "/dev/pts/3")
-    config = Config(mcu=McuConfig(port="/dev/ttyUSB0"))
-    real = run.banner(config, "acsard.toml", "/dev/ttyUSB0")
-    missing = run.banner(config, "acsard.toml", "/dev/ttyUSB0", "/dev/ttyUSB0 is not there")
-    assert "SIMULATOR" in simulated
-    assert "no real robot will move" in simulated
-    assert "SIMULATOR" not in real
-    assert "none yet: /dev/ttyUSB0 is not there" in missing
-    assert "/dev/ttyUSB0 at 115200 baud" in real
-    assert all("acsard/acsar/..." in text and "acsard.toml" in text for text in (simulated, real))
-
-
-def test_the_banner_has_what_a_newcomer_types_next_and_the_page_where_it_is_served() -> None:
-    web = WebConfig(address=("http://127.0.0.1:8080", "https://0.0.0.0:8443"))
-    config = Config(web=web)
-    silent, served = (
-        run.banner(config, "x.toml", "/dev/x", served=enabled) for enabled in (False, True)
-    )
-    for banner in (silent, served):
-        tries = [line.split("  ")[0] for line in map(str.strip, banner.splitlines())]
-        assert tries[-3:] == ["acsard drive", "acsard top", "acsard call stop"]
-    assert "  page    http://127.0.0.1:8080, https://0.0.0.0:8443, for a browser; " in served
-    assert "page" not in silent
-    assert served.count("\n") == silent.count("\n") + 1
-
-
-def test_the_banner_s_tools_reach_this_daemon_and_no_other() -> None:
-    bare = parser(["run"]).parse_args(["run"])
-    assert run.reach(bare) == ""
+def test_the_banner_has_the_approved_words(approved: Callable[[Path, str], None]) -> None:
+    """It tells a simulator from a robot, and what a newcomer types next reaches this daemon."""
+    assert run.reach(parser(["run"]).parse_args(["run"])) == ""
     words = ["run", "--id", "two", "--listen", "tcp/0.0.0.0:7458", "--config", "my robot.toml"]
-    options = run.reach(parser(["run"]).parse_args(words))
-    assert options == " --config 'my robot.toml' --connect tcp/127.0.0.1:7458 --id two"
-    banner = run.banner(Config(), "acsard.toml", "/dev/pts/3", reach=options)
-    assert f"acsard call stop{options} " in banner
+    reach = run.reach(parser(["run"]).parse_args(words))
+    real = Config(mcu=McuConfig(port="/dev/ttyUSB0"))
+    served = Config(web=WebConfig(address=("http://127.0.0.1:8080", "https://0.0.0.0:8443")))
+    banners = {
+        "a simulator": run.banner(Config(), "acsard.toml", "/dev/pts/3"),
+        "a robot": run.banner(real, "acsard.toml", "/dev/ttyUSB0"),
+        "a board that is missing": run.banner(real, "x.toml", "/dev/ttyUSB0", "it is not there"),
+        "with the page": run.banner(served, "x.toml", "/dev/x", served=True),
+        "with options": run.banner(Config(), "x.toml", "/dev/x", reach=reach),
+    }
+    text = "".join(f"--- {what}\n{banner}" for what, banner in banners.items())
+    approved(Path(__file__).with_name("words") / "banner.txt", text.replace(version(), "VERSION"))
 
 
 def test_on_a_terminal_the_page_is_served_unless_it_is_disabled_or_missing(

@@ -5,18 +5,19 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
+from collections.abc import Callable
+from pathlib import Path
 
 import pytest
 from msgspec.structs import replace
 
 from acsard.cli import VERBS, main
 from acsard.cli.topics import ros_table
-from acsard.core.config.named_faults import ARGUMENTS
 from acsard.core.config.settings import CommandsConfig, Config, RosConfig, Source
 from acsard.core.messages.keys_and_roles import PUBLISHED
 from acsard.core.ros.transports import PARAMETERS_PREFIX, left_out, ros_names
+from acsard.host.processes import Holder
 from acsard.machine.serial_ports import SerialDevice
-from tests.each import each
 
 
 def test_every_ros_name_is_listed_with_what_it_stands_for() -> None:
@@ -75,29 +76,25 @@ MEGA = SerialDevice(
 )
 
 
-@pytest.mark.parametrize(
-    ("ports", "code", "words"),
-    [
-        ([], 1, "no serial ports: check that the board is plugged in"),
-        ([ON_THE_MAINBOARD], 0, "acsard finds no board: check that the board is plugged in"),
-        ([ON_THE_MAINBOARD, UNKNOWN], 0, "unplug the board and run this again"),
-        ([ON_THE_MAINBOARD, UNKNOWN, MEGA], 0, ""),
-    ],
-)
-def test_the_tool_says_that_no_port_looks_like_a_board(
-    ports: list[SerialDevice],
-    code: int,
-    words: str,
+def test_the_ports_and_what_looks_like_a_board_are_told_in_the_approved_words(
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
+    approved: Callable[[Path, str], None],
 ) -> None:
-    monkeypatch.setattr("acsard.cli.ports.serial_devices", lambda: ports)
-    assert main(["ports"]) == code
-    out, err = capsys.readouterr()
-    assert words in err
-    assert bool(words) == bool(err)
-    assert ('port = "/dev/acsar"' in out) == (MEGA in ports)
-    assert all(port.device in out for port in ports)
+    text = ""
+    held = replace(MEGA, holders=[Holder(77, "acsard")])
+    for found in (
+        [],
+        [ON_THE_MAINBOARD],
+        [ON_THE_MAINBOARD, UNKNOWN],
+        [UNKNOWN, MEGA],
+        [MEGA, held],
+    ):
+        monkeypatch.setattr("acsard.cli.ports.serial_devices", lambda found=found: found)
+        code = main(["ports"])
+        out, err = capsys.readouterr()
+        text += f"--- {len(found)} ports, exit {code}\n{out}{err}"
+    approved(Path(__file__).with_name("words") / "ports.txt", text)
 
 
 def test_json_has_no_control_characters_from_the_description_of_a_device(
@@ -109,20 +106,3 @@ def test_json_has_no_control_characters_from_the_description_of_a_device(
     out = capsys.readouterr().out
     assert out.strip().isprintable()
     assert json.loads(out)[0]["description"] == port.description
-
-
-@pytest.fixture
-def words(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> list[str]:
-    """Return the words of the help."""
-    monkeypatch.setenv("COLUMNS", "200")
-    with pytest.raises(SystemExit):
-        main(["sim", "--help"])
-    return [word.rstrip(",;") for word in capsys.readouterr().out.split()]
-
-
-@each("name", ARGUMENTS)
-def test_the_help_names_each_argument_of_a_fault(name: str, words: list[str]) -> None:
-    (named,) = [word for word in words if word.startswith(f"{name}=")]
-    arguments = named.partition("=")[2].split(":")
-    assert len(arguments) == len(ARGUMENTS[name])
-    assert "NUMBER" not in arguments
