@@ -1,6 +1,6 @@
 """What the tools print beside a running robot, as approved in `words/cli.txt`.
 
-`pytest --approve` writes the file anew. `tests/unit/cli/transcripts` has what needs no robot.
+`pytest --approve` writes the file anew. `tests/unit/words/transcripts` has what needs no robot.
 """
 
 from __future__ import annotations
