@@ -17,6 +17,7 @@ from functools import partial
 from aiohttp import web
 from msgspec.structs import replace
 
+from acsard.bus.zenoh_sessions import MAX_MESSAGE_BYTES
 from acsard.core.config.settings import WebConfig
 from acsard.host import clock
 from acsard.host.rate_limits import Buckets, Rate
@@ -36,7 +37,6 @@ from acsard.web.callers import (
 )
 from acsard.web.connections import MAX_OF_TOKEN, Connections, HttpConnection
 from acsard.web.routes import Route
-from acsard.web.socket_messages import MAX_MESSAGE_BYTES
 from acsard.web.tokens import ReadTokens
 
 # Requests of one token, and messages of one WebSocket. A page asks for 20 pictures a second, and

@@ -17,6 +17,7 @@ from aiohttp import web
 from msgspec import UNSET, Meta, Struct, UnsetType, inspect
 
 from acsard import __version__
+from acsard.bus.zenoh_sessions import MAX_MESSAGE_BYTES
 from acsard.core.config.live import WHEN_TEXTS, find_live_setting, flat
 from acsard.core.config.settings import WebConfig
 from acsard.core.messages.encodings import DecodeError
@@ -34,7 +35,6 @@ from acsard.web.camera import Camera
 from acsard.web.connections import Connections
 from acsard.web.recordings import BlackBox, Recording
 from acsard.web.routes import JSON, RECORDINGS_ROLE, Body, Problem, Route, services, values
-from acsard.web.socket_messages import MAX_MESSAGE_BYTES
 from acsard.web.streams import as_json
 from acsard.web.tokens import ReadTokens
 from acsard.web.viewer import PING_INTERVAL_S, Parts, Viewer

@@ -189,27 +189,19 @@ class Certificate:
         self._files = CertificateFiles(*files_in(directory))
         self.names = set[str]()
         self.context = self._load()
-        self._is_renewed, self._reported = False, ""
 
     def read(self) -> None:
         """Load the files if they were replaced. Open connections keep the old certificate."""
-        self._is_renewed = self._files.renewed() or self._is_renewed
-        if not self._is_renewed:
+        if not self._files.renewed():
             return
         try:
             self.context = self._load()
         except (OSError, ValueError) as error:
-            # The files may just be in the process of being replaced. The next round tries again.
-            text = f"the page cannot use its new TLS certificate yet: {error}"
-            if text != self._reported:
-                self._log.event(Event("configuration", text, "warning"))
-            self._reported = text
-            return
-        self._is_renewed, self._reported = False, ""
-        self._log.info(
-            "configuration",
-            text="the page uses its new TLS certificate and keeps its open connections",
-        )
+            text = f"the page cannot use its new TLS certificate: {error}"
+            self._log.event(Event("configuration", text, "warning"))
+        else:
+            text = "the page uses its new TLS certificate and keeps its open connections"
+            self._log.info("configuration", text=text)
 
     def _load(self) -> ssl.SSLContext:
         context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)

@@ -18,9 +18,6 @@ from acsard.core.messages.permissions import COMMAND_ROLE
 from acsard.core.messages.schema import Beat
 from acsard.core.values import AcsardError, Role
 
-# Of a client. A command has about a hundred bytes.
-MAX_MESSAGE_BYTES = 65536
-
 # At which the values of a key are sent: the maximum, and the default.
 MAX_RATE, USUAL_RATE = 50.0, 10.0
 
