@@ -38,7 +38,7 @@ READ_BYTES, WRITE_BYTES = 16384, 65536
 
 # Of a request. A browser sends the cookies for all ports of a host in one header, so less could
 # lock it out.
-FIELD_BYTES, FIELDS = 8190, 64
+FIELD_BYTES, FIELDS = 8190, 32
 
 
 class HasContext(Protocol):
