@@ -13,8 +13,10 @@ from acsard.machine.authority import Authority
 from tests.system.browser import NAME, Page
 from tests.system.builds import ros2dds_bridge
 from tests.system.bystander import standing_by
+from tests.system.chromium import PHONE, Browser, browsing
 from tests.system.harness import Bus, Daemon, Peer, until
 from tests.system.hosts import Hosts, two_hosts
+from tests.system.phone_page import Phone, Robot, running
 
 if TYPE_CHECKING:
     from tests.system.dds import DdsDomain, NewDomain
@@ -110,3 +112,41 @@ def standing(daemon: Daemon) -> Iterator[Bus]:
         bus.ask("srv/clear")
         bus.at_rest()
         yield bus
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Browser]:
+    with browsing() as browser:
+        yield browser
+
+
+@pytest.fixture(scope="module")
+def common_robot(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Robot]:
+    """The robot for all tests that change only its latch. Starting it takes 1 s."""
+    with running(tmp_path_factory.mktemp("common")) as robot:
+        yield robot
+
+
+@pytest.fixture
+def own_robot(tmp_path: Path) -> Iterator[Robot]:
+    with running(tmp_path) as robot:
+        yield robot
+
+
+@pytest.fixture
+def phone(request: pytest.FixtureRequest, browser: Browser) -> Iterator[Phone]:
+    """The newly opened page of a robot that is at rest and may be driven."""
+    own = "own_robot" in request.fixturenames
+    robot: Robot = request.getfixturevalue("own_robot" if own else "common_robot")
+    phone = Phone(*robot, browser)
+    robot.bus.ask("srv/clear")
+    robot.bus.ask("srv/activate")
+    robot.bus.at_rest()
+    browser.size(*PHONE)
+    browser.said.clear()
+    browser.open(robot.server.here)
+    phone.shows("mode", "READY")
+    phone.shows("age", "live")
+    yield phone
+    browser.lift()
+    browser.open("about:blank")
