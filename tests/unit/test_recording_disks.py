@@ -9,9 +9,9 @@ import resource
 import shutil
 import threading
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import pytest
 from msgspec.structs import replace
@@ -20,8 +20,7 @@ from acsard.core.config.settings import Config, RecordConfig
 from acsard.core.guard import Guard
 from acsard.core.robot import Robot
 from acsard.core.values import NS_PER_S, Event, Instant
-from acsard.recording import directory, recorder
-from acsard.recording.directory import RecordingDirectory
+from acsard.recording import recorder
 from acsard.recording.file import SUFFIX, Recording, listed
 from acsard.recording.recorder import Recorder
 from tests.unit.drives import drive
@@ -312,152 +311,3 @@ def test_the_control_loop_only_appends_to_the_queue(
     assert box.recorder._thread.is_alive()
     goes.set()
     box.recorder._thread.join(20.0)
-
-
-# the directory
-
-NOW_NS = 1_795_935_600 * NS_PER_S
-
-
-def new(where: Path, megabytes: float = 10.0) -> RecordingDirectory:
-    return RecordingDirectory(RecordConfig(str(where), megabytes))
-
-
-def record(store: RecordingDirectory, wall_ns: int = NOW_NS, size: int = 0) -> Path:
-    with store.begin(wall_ns) as file:
-        file.write(bytes(size))
-        return Path(file.name)
-
-
-def modes(where: Path) -> list[str]:
-    """Return the modes of the directory and of its files, in octal."""
-    return [oct(path.stat().st_mode & 0o777)[2:] for path in (where, *listed(where))]
-
-
-def numbers(where: Path) -> list[int]:
-    return [int(path.name[:6]) for path in listed(where)]
-
-
-def test_file_numbers_increase_whatever_the_clock_shows(tmp_path: Path) -> None:
-    for wall_ns in (NOW_NS, 0, NOW_NS - 86_400 * NS_PER_S):
-        record(new(tmp_path), wall_ns)
-    assert numbers(tmp_path) == [1, 2, 3]
-    assert listed(tmp_path)[1].name == f"000002-19700101T000000Z{SUFFIX}"
-
-
-def test_no_clock_deletes_a_recording(tmp_path: Path) -> None:
-    store = new(tmp_path, 30.0)
-    for year in (2026, 2106, 1970, 2250, 1999):
-        path = record(store, (year - 1970) * 31_556_952 * NS_PER_S, size=5_000_000)
-        os.utime(path, (0, 0))
-        assert store.make_room() == ""
-    assert numbers(tmp_path) == [1, 2, 3, 4, 5]
-    for _ in range(2):
-        record(store, size=5_000_000)
-        store.make_room()
-    assert numbers(tmp_path) == [3, 4, 5, 6, 7], "the order is that of the numbers"
-
-
-@pytest.mark.parametrize(
-    ("service", "private", "umask", "wanted"),
-    [
-        (".", "elsewhere", 0, ["750", "640"]),
-        (".", "elsewhere", 0o077, ["750", "640"]),
-        # Every user may read the directory of a service that only root can enter.
-        ("b", ".", 0o077, ["755", "644"]),
-        (".", ".", 0, ["750", "640"]),  # it is another directory
-        ("b", "elsewhere", 0, ["750", "640"]),  # everybody gets there, not only root
-    ],
-)
-def test_the_group_or_every_user_may_read_a_recording(
-    service: str, private: str, umask: int, wanted: list[str],
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
-) -> None:  # fmt: skip
-    monkeypatch.setenv("ACSARD_RECORD", str(tmp_path / service))
-    monkeypatch.setattr(directory, "PRIVATE_STATE", tmp_path / private)
-    before = os.umask(umask)
-    try:
-        record(new(tmp_path / "b"))
-    finally:
-        os.umask(before)
-    assert modes(tmp_path / "b") == wanted
-
-
-@pytest.mark.skipif(os.geteuid() != 0, reason="gives a directory away")
-def test_recording_works_in_a_directory_of_another_user(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("ACSARD_RECORD", ".")
-    monkeypatch.setattr(directory, "PRIVATE_STATE", tmp_path)
-    monkeypatch.chdir(tmp_path)
-    tmp_path.chmod(0o777)
-    child = os.fork()
-    if child == 0:
-        try:
-            os.setresuid(65534, 65534, 65534)
-            record(new(Path()))
-        finally:
-            os._exit(0)
-    os.waitpid(child, 0)
-    assert modes(tmp_path) == ["777", "644"]
-
-
-class Disk(NamedTuple):
-    f_blocks: int
-    f_bavail: int
-    f_frsize: int = 1
-
-
-@pytest.mark.parametrize(
-    ("files", "each_mb", "limit_mb", "total_mb", "free_mb", "kept"),
-    [
-        (12, 1, 10, 1e6, 1e6, 9),  # so that one more fits
-        (60, 1, 1000, 1000, 40, 30),  # 60 + 40 - 50 for other programs, and 20 for the next file
-        (30, 1, 10, 1000, 0, 9),  # others fill the disk: the smallest limit, less the next file
-        (1, 1, 10, 0, 0, 1),  # a disk that does not report its size has room
-        (1, 20, 10, 1e6, 1e6, 1),  # the newest file stays
-    ],
-)
-def test_the_oldest_files_go_and_leave_room(
-    files: int, each_mb: int, limit_mb: float, total_mb: float, free_mb: float, kept: int,
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
-) -> None:  # fmt: skip
-    monkeypatch.setattr(os, "statvfs", lambda _: Disk(int(total_mb * 1e6), int(free_mb * 1e6)))
-    store = new(tmp_path, limit_mb)
-    for _ in range(files):
-        record(store, size=each_mb * 1_000_000)
-    (tmp_path / "000000-notes.txt").write_bytes(bytes(5_000_000))
-    text = store.make_room()
-    assert numbers(tmp_path) == [*range(files - kept + 1, files + 1)]
-    assert (tmp_path / "000000-notes.txt").exists()
-    if limit_mb == 1000:
-        assert "30 recordings deleted (000001-" in text
-        assert "only 40.0 MB of the disk were free, and recordings leave 50.0 MB" in text
-    else:
-        assert bool(text) == (free_mb == 0 != total_mb)
-
-
-def test_a_file_that_another_process_removes_meanwhile_does_no_harm(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    store = new(tmp_path)
-    first, *_ = [record(store, size=8_000_000) for _ in range(3)]
-    unlink, stat = Path.unlink, Path.stat
-
-    def twice(path: Path, missing_ok: bool = False) -> None:
-        unlink(path)
-        unlink(path)
-
-    def removed(path: Path, *, follow_symlinks: bool = True) -> os.stat_result:
-        if path == first:
-            with suppress(FileNotFoundError):
-                unlink(path)
-        return stat(path, follow_symlinks=follow_symlinks)
-
-    monkeypatch.setattr(Path, "unlink", twice)
-    store.make_room()
-    assert not first.exists()
-    first.touch()
-    monkeypatch.setattr(Path, "stat", removed)
-    store.make_room()
-    assert not os.path.exists(first)
