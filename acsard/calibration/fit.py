@@ -9,11 +9,12 @@ cut). The errors on the runs that were left out decide whether the new values ar
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from itertools import pairwise
 
 import numpy as np
-from msgspec import Struct
+import numpy.typing as npt
+from msgspec import Struct, field
 
 from acsard.calibration.log import Complexes, Floats, LogError, Mask, Run
 from acsard.core.config.settings import Config, DriveConfig
@@ -118,7 +119,7 @@ class Piece:
             at = run.place_t - p[POSE_DELAY]
             model = np.interp(at, self.t, place.real) + 1j * np.interp(at, self.t, place.imag)
             lever = (p[AHEAD] + 1j * p[ASIDE]) * np.exp(1j * np.interp(at, self.t, heading))
-            off = aligned(run.place, model + lever)
+            off = aligned(run.place, model + lever).off
             made["positions"] = self._inside(
                 np.concatenate((at, at)), np.concatenate((off.real, off.imag))
             )
@@ -131,8 +132,14 @@ class Piece:
         return np.where((at >= self.t[0]) & (at <= self.t[-1]), values, np.nan)
 
 
-def aligned(seen: Complexes, model: Complexes) -> Complexes:
-    """Return what remains of `seen` after `model` was turned and moved onto it, in its axes.
+class Alignment(Struct, frozen=True):
+    turn: complex  # from the model to what was seen, of size 1
+    weight: Floats  # of each point
+    off: Complexes  # what remains of the points, in the axes of the model
+
+
+def aligned(seen: Complexes, model: Complexes) -> Alignment:
+    """Turn and move `model` onto `seen`.
 
     Three rounds of weights keep single wrong positions from turning the rest.
     """
@@ -141,10 +148,11 @@ def aligned(seen: Complexes, model: Complexes) -> Complexes:
         share = weight / weight.sum()
         a, b = seen - share @ seen, model - share @ model
         turn = complex(np.vdot(b, weight * a))
-        off = a * np.conj(turn / abs(turn) if turn else 1.0) - b
+        turn = turn / abs(turn) if turn else 1.0 + 0j
+        off = a * turn.conjugate() - b
         size = np.abs(off)
         weight = np.minimum(1.0, HUBER * np.median(size) / np.maximum(size, 1e-12))
-    return np.asarray(off)
+    return Alignment(turn, weight, off)
 
 
 class Problem:
@@ -223,29 +231,48 @@ class Problem:
             p[self.free] += step * scale
             if float(np.abs(step).max()) < CONVERGED:
                 break
-        whole = curvature.sum(axis=0) + prior
-        left_out = np.repeat(p[None], len(self.pieces), axis=0)
-        for n in range(len(self.pieces)):
-            left_out[n, self.free] -= np.linalg.solve(whole - curvature[n], score[n]) * scale
-        return Solution(p, left_out, self._covariance(whole, left_out), sizes)
+        found = Solution(p, sizes, self.free, scale, curvature, score)
+        found.left_out = np.array([found.without(n) for n in np.eye(len(self.pieces), dtype=bool)])
+        found.covariance = self._covariance(found)
+        return found
 
-    def _covariance(self, whole: Floats, left_out: Floats) -> Floats:
+    def _covariance(self, found: Solution) -> Floats:
         # The sum of two, each of which misses what the other one sees: the jackknife misses what a
         # single piece shows, and the inverse information that a robot skids for a whole piece. The
         # prior is in the second one.
-        scale = np.diag(self.stds[self.free])
+        scale = np.diag(found.scale)
         # A reading by tape has its deviation, and may be the only one of its kind.
-        sensed = left_out[[not piece.run.tape for piece in self.pieces]][:, self.free]
+        sensed = found.left_out[[not piece.run.tape for piece in self.pieces]][:, self.free]
         apart, n = sensed - sensed.sum(axis=0) / max(1, len(sensed)), max(1, len(sensed))
         jackknife = apart.T @ apart * (n - 1) / n
-        return np.asarray((jackknife + scale @ np.linalg.inv(whole) @ scale)[GEOMETRY, GEOMETRY])
+        return np.asarray(
+            (jackknife + scale @ np.linalg.inv(found.whole) @ scale)[GEOMETRY, GEOMETRY]
+        )
 
 
-class Solution(Struct, frozen=True):
+class Solution(Struct):
+    """The parameters that fit best, and what each piece adds to them."""
+
     p: Floats
-    left_out: Floats  # parameters without each piece
-    covariance: Floats  # of the logarithms of left radius, right radius and track
     sizes: dict[str, float]
+    free: npt.NDArray[np.int64]
+    scale: Floats  # of the free parameters
+    curvature: Floats  # of each piece
+    score: Floats
+    left_out: Floats = field(default_factory=lambda: np.zeros(0))  # without each piece
+    covariance: Floats = field(default_factory=lambda: np.zeros(0))  # of GEOMETRY
+
+    @property
+    def whole(self) -> Floats:
+        return np.asarray(self.curvature.sum(axis=0) + np.eye(len(self.free)))
+
+    def without(self, pieces: Mask) -> Floats:
+        """Return about the parameters that fit the other pieces best."""
+        p = self.p.copy()
+        rest = self.whole - self.curvature[pieces].sum(axis=0)
+        step = np.linalg.solve(rest, self.score[pieces].sum(axis=0))
+        p[self.free] -= step * self.scale
+        return p
 
 
 def _robust(residuals: Sequence[Floats]) -> float:
@@ -295,7 +322,7 @@ class Fit(Struct, frozen=True):
     covariance: Floats  # of the logarithms of left radius, right radius and track
     sensors: tuple[str, ...]
     pieces: tuple[Piece, ...]
-    left_out: Floats
+    without: Callable[[Mask], Floats]  # parameters that fit the other pieces
     gain: float  # logarithm of the ratio of the errors, now to new, of all sensors
     gain_std: float
     worst: float  # the same of the sensor that gains least
@@ -368,7 +395,7 @@ def _cost(problem: Problem, p: Floats) -> float:
 
 def _judged(problem: Problem, solution: Solution, base: Base) -> Fit:
     squares = np.zeros((2, len(problem.pieces), len(problem.sensors)))
-    sums = np.zeros((2, len(problem.pieces), len(problem.sensors), 2))
+    counts = np.zeros((len(problem.pieces), len(problem.sensors)))
     for n, piece in enumerate(problem.pieces):
         new = solution.left_out[n]
         now = new.copy()
@@ -377,7 +404,7 @@ def _judged(problem: Problem, solution: Solution, base: Base) -> Fit:
             for s, e in piece.residuals(p).items():
                 at, e = problem.sensors.index(s), e[np.isfinite(e)]
                 squares[k, n, at] = (np.minimum(np.abs(e), CAP * solution.sizes[s]) ** 2).sum()
-                sums[k, n, at] = abs(e.sum()), len(e)
+                counts[n, at] = len(e)
 
     def gains(kept: Mask) -> Floats:
         now, new = squares[:, kept].sum(axis=1)
@@ -387,7 +414,7 @@ def _judged(problem: Problem, solution: Solution, base: Base) -> Fit:
     gain = gains(every)
     others = [float(gains(np.arange(len(every)) != n).sum()) for n in range(len(every))]
     spread = math.sqrt(len(every) - 1) * float(np.std(others))
-    rms = np.sqrt(squares.sum(axis=1) / np.maximum(1.0, sums[0, :, :, 1].sum(axis=0)))
+    rms = np.sqrt(squares.sum(axis=1) / np.maximum(1.0, counts.sum(axis=0)))
     errors = {s: Errors(*rms[:, k].tolist()) for k, s in enumerate(problem.sensors)}
     turn = None
     for s in ("gyro", "headings"):
@@ -396,10 +423,9 @@ def _judged(problem: Problem, solution: Solution, base: Base) -> Fit:
             break
     return Fit(
         base, solution.p, solution.covariance, tuple(problem.sensors), tuple(problem.pieces),
-        solution.left_out,
-        float(gain.sum()), spread, float(gain.min()), turn, errors.get("positions"),
-        errors.get("tape"), bool({"positions", "tape"} & set(problem.sensors)),
-        _unexplained(problem, solution.p),
+        solution.without, float(gain.sum()), spread, float(gain.min()), turn,
+        errors.get("positions"), errors.get("tape"),
+        bool({"positions", "tape"} & set(problem.sensors)), _unexplained(problem, solution.p),
     )  # fmt: skip
 
 

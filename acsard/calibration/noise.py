@@ -7,25 +7,38 @@ of ratio and track that last for a whole window. The shares are the non-negative
 
 from __future__ import annotations
 
+import cmath
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 import numpy.typing as npt
 from msgspec import Struct
 
-from acsard.calibration.fit import AHEAD, ASIDE, BIAS, GYRO_DELAY, POSE_DELAY, SCALE, Fit, Piece
-from acsard.calibration.log import Floats
+from acsard.calibration.fit import (
+    AHEAD,
+    ASIDE,
+    BIAS,
+    GYRO_DELAY,
+    POSE_DELAY,
+    SCALE,
+    Fit,
+    Piece,
+    aligned,
+)
+from acsard.calibration.log import Complexes, Floats, Run
 from acsard.core.config.settings import OdometryConfig
 from acsard.core.values import Seconds
 
 WINDOWS_S = 2.0, 6.0, 30.0
+POSITION_WINDOWS_S = 6.0, 12.0, 30.0  # of positions alone; they overlap by half
 SHORTEST = 0.7  # of a window at the end of a run, as a fraction
 MIN_WINDOWS, FOLDS = 20, 5
 LEAST_ROLL_M, LEAST_WAY_M = 1e-3, 0.02
 STRAIGHT = 0.8  # way / rolled path of a window that shows an error of the distance
 OUTLIER = 9.0  # variances of a squared error, above which it counts as this
 MEDIAN = 0.455  # of a chi-square of one degree of freedom, whose mean is 1
+MAX_ANGLE = 0.2  # rad, that errors of positions may turn half a window
 FLOOR = 1e-7  # of a variance per metre or radian
 SURE = 2.0
 
@@ -45,20 +58,19 @@ class Noise(Struct, frozen=True):
     distance_better: bool
 
 
-def noise(fit: Fit, odometry: OdometryConfig) -> Noise:
-    """Return the noise that the runs of a fit show, and whether it describes them better.
-
-    Positions without headings show only the noise of the distance. Fits of the heading's noise to
-    the directions between positions stated a tenth of the variance, or less.
-    """
+def noise(runs: Sequence[Run], fit: Fit, odometry: OdometryConfig) -> Noise:
+    """Return the noise that the runs of a fit show, and whether it describes them better."""
     headings, distances = _Rows(), _Rows()
-    whole, passed = sum(piece.run.seconds for piece in fit.pieces) + 1e-9, 0.0
-    for piece, p in zip(fit.pieces, fit.left_out, strict=True):
-        for begin, heading, distance in _windows(piece, p):
-            group = int(FOLDS * (passed + begin - piece.t[0]) / whole)
+    # Positions alone show the heading over long ways only, and so in whole runs.
+    turns = {"gyro", "headings"} & set(fit.sensors)
+    parts = [piece.run for piece in fit.pieces] if turns else runs
+    whole, passed = sum(run.seconds for run in parts) + 1e-9, 0.0
+    for run in parts:
+        for begin, heading, distance in _windows(run, fit):
+            group = int(FOLDS * (passed + begin - run.t[0]) / whole)
             headings.add(heading, group)
             distances.add(distance, group)
-        passed += piece.run.seconds
+        passed += run.seconds
     track = fit.base.track * math.exp(fit.p[2])
     stated = np.array([
         odometry.yaw_variance_per_metre, odometry.yaw_variance_per_radian,
@@ -91,26 +103,37 @@ class _Rows:
             self.groups.append(group)
 
 
-def _windows(piece: Piece, p: Floats) -> Iterator[tuple[Seconds, Row | None, Row | None]]:
-    t, run, path = piece.t, piece.run, Path(piece, p)
-    for length in WINDOWS_S:
+def _windows(run: Run, fit: Fit) -> Iterator[tuple[Seconds, Row | None, Row | None]]:
+    whole, t = Piece(run, fit.base), run.t
+    own = np.array(
+        [(piece.run.name, piece.run.tape) == (run.name, run.tape) for piece in fit.pieces]
+    )
+    begins, ends = np.array([(piece.t[0], piece.t[-1]) for piece in fit.pieces]).T
+    alone = not (whole.gyro or len(run.yaw_t))
+    for length in POSITION_WINDOWS_S if alone else WINDOWS_S:
         if t[-1] - t[0] < SHORTEST * min(length, WINDOWS_S[1]):
             continue
         length = min(length, float(t[-1] - t[0]))
-        for begin in np.arange(t[0], t[-1] - SHORTEST * length, length):
-            ends = np.array([begin, min(begin + length, t[-1])])
+        step = length / 2 if alone else length
+        for begin in np.arange(t[0], t[-1] - SHORTEST * length, step):
+            edges = np.array([begin, min(begin + length, t[-1])])
+            p = fit.without(own & (begins < edges[1]) & (ends > begin))
+            path = Path(whole, p)
             row = far = None
-            if piece.gyro:
-                late = ends + p[GYRO_DELAY]
+            if whole.gyro:
+                late = edges + p[GYRO_DELAY]
                 seen = np.diff(np.interp(late, run.gyro_t, run.turned) - p[BIAS] * late)[0]
-                row = _heading(path, ends, seen * math.exp(p[SCALE]))
+                row = _heading(path, edges, seen * math.exp(p[SCALE]))
             elif len(run.yaw_t):
                 # At the samples themselves: between them, the heading is unknown.
-                at = _nearest(run.yaw_t, ends + p[POSE_DELAY])
+                at = _nearest(run.yaw_t, edges + p[POSE_DELAY])
                 row = _heading(path, run.yaw_t[at] - p[POSE_DELAY], np.diff(run.yaw[at])[0])
             if len(run.place_t) > 2:
-                at = _nearest(run.place_t, ends + p[POSE_DELAY])
+                at = _nearest(run.place_t, edges + p[POSE_DELAY])
                 far = _distance(path, run.place_t[at] - p[POSE_DELAY], np.diff(run.place[at])[0])
+                if alone:
+                    inside = slice(*at)
+                    row = _bend(path, run.place_t[inside] - p[POSE_DELAY], run.place[inside])
             yield float(begin), row, far
 
 
@@ -137,6 +160,34 @@ def _heading(path: Path, t: Floats, seen: float) -> Row | None:
     way, roll, spin = (float(np.diff(v)[0]) for v in path.at(t)[:3])
     off = math.remainder(seen - way, math.tau)
     return [roll, spin, way**2, roll**2, 1.0, off**2] if roll > LEAST_ROLL_M else None
+
+
+def _bend(path: Path, t: Floats, seen: Complexes) -> Row | None:
+    # The turn of the positions from the first to the second half of a window, beside that of the
+    # wheels. An error of the heading turns all later positions about the place where it happens.
+    if len(t) < 8:
+        return None
+    heading, rolled, turned, x, y = path.at(t)
+    model = x + 1j * y
+    middles = (model[1:] + model[:-1]) / 2
+    off, sensor, share = 0.0, 0.0, np.zeros(len(middles))
+    for sign, half in ((-1, slice(None, len(t) // 2)), (1, slice(len(t) // 2, None))):
+        found = aligned(seen[half], model[half])
+        weight = found.weight
+        arms = np.zeros(len(t), complex)
+        arms[half] = weight * (model[half] - weight @ model[half] / weight.sum()).conj()
+        square = float((np.abs(arms[half]) ** 2 / weight).sum())
+        if square <= 0.0 or np.median(np.abs(found.off)) > MAX_ANGLE * math.sqrt(square):
+            return None
+        later = [np.cumsum(v[::-1])[::-1][1:] for v in (arms * model, arms)]
+        share += sign * (later[0] - middles * later[1]).real / square
+        off += sign * cmath.phase(found.turn)
+        sensor += 1 / square
+    roll, spin, way = (np.diff(v) for v in (rolled, turned, heading))
+    return [
+        float(share**2 @ roll), float(share**2 @ spin), float(share @ way) ** 2,
+        float(share @ roll) ** 2, sensor, math.remainder(off, math.tau) ** 2,
+    ]  # fmt: skip
 
 
 def _distance(path: Path, t: Floats, chord: complex) -> Row | None:

@@ -84,7 +84,7 @@ def _result(log: Log, config: Config, source: str, found: Fit, notes: list[str])
     stds = np.sqrt(np.diag(found.covariance))[list(MULTIPLIERS.values())]
     stds = np.where([name == TRACK_NAME for name in MULTIPLIERS], found.shares[0], stds)
     stds = stds * configured * factors
-    shown = noise(found, config.odometry)
+    shown = noise(log.runs, found, config.odometry)
     settings: dict[str, float] = {}
     decisions = [*_geometry(found, config, settings, shown)]
     decisions += _noise(found, config, settings, shown)
@@ -158,10 +158,8 @@ def _noise(found: Fit, config: Config, settings: dict[str, float], shown: Noise)
             f"{REPORT_M:g} m and one turn, where it is {_two(now)} deg, because that describes "
             "the runs better."
         )
-    elif {"gyro", "headings"} & set(found.sensors):
-        yield "The noise of the heading stays as configured: this log describes it no better."
     else:
-        yield "The noise of the heading stays as configured: only a gyro or headings show it."
+        yield "The noise of the heading stays as configured: this log describes it no better."
     if shown.distance_better and shown.distance_per_metre:
         settings["odometry.distance_variance_per_metre"] = shown.distance_per_metre
         new, now = (
