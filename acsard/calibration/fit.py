@@ -40,9 +40,11 @@ DELAYS_S = np.linspace(-1.0, 1.0, 41)
 FINEST = 1e-4  # rad or m, of any sensor
 STEPS, CONVERGED = 15, 1e-4
 PIECES = 12  # at least
+FARTHEST = 3.0  # deviations of the prior, by which a piece that is left out moves a parameter
 
 SURE = 2.0  # standard deviations by which the new values must be better, or else by half
 CAP = 10.0  # robust standard deviations: a residual of a run that was left out counts as at most
+AGREES = 2.0  # deviations of a reading by tape
 WORSE = 0.02  # by which the error of one sensor may grow, as a fraction
 
 SENSORS = "gyro", "positions", "headings", "tape"
@@ -271,7 +273,7 @@ class Solution(Struct):
         p = self.p.copy()
         rest = self.whole - self.curvature[pieces].sum(axis=0)
         step = np.linalg.solve(rest, self.score[pieces].sum(axis=0))
-        p[self.free] -= step * self.scale
+        p[self.free] -= np.clip(step, -FARTHEST, FARTHEST) * self.scale
         return p
 
 
@@ -406,9 +408,13 @@ def _judged(problem: Problem, solution: Solution, base: Base) -> Fit:
                 squares[k, n, at] = (np.minimum(np.abs(e), CAP * solution.sizes[s]) ** 2).sum()
                 counts[n, at] = len(e)
 
+    # A reading that is missed by less speaks neither for the new values nor against them.
+    least = np.array([AGREES**2 if s == "tape" else 0.0 for s in problem.sensors])
+
     def gains(kept: Mask) -> Floats:
-        now, new = squares[:, kept].sum(axis=1)
-        return np.asarray(np.log((now + 1e-18) / (new + 1e-18)) / 2)
+        floor = least * counts[kept].sum(axis=0) + 1e-18
+        now, new = np.maximum(squares[:, kept].sum(axis=1), floor)
+        return np.asarray(np.log(now / new) / 2)
 
     every = np.ones(len(problem.pieces), dtype=bool)
     gain = gains(every)

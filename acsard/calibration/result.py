@@ -30,6 +30,7 @@ MULTIPLIERS = {
 }  # fmt: skip
 TRACK_NAME = "wheel_separation_multiplier"
 SHORT = 1.5  # times the configured response time, from which a longer one is written
+MISREAD = 4.0  # deviations of a reading that does not fit the others
 REPORT_M = 10.0  # of driving, for the sentence about noise
 
 
@@ -82,11 +83,12 @@ def _result(log: Log, config: Config, source: str, found: Fit, notes: list[str])
     factors = np.exp(p[list(MULTIPLIERS.values())])
     # A track without the size of the wheels is one beside their mean radius.
     stds = np.sqrt(np.diag(found.covariance))[list(MULTIPLIERS.values())]
-    stds = np.where([name == TRACK_NAME for name in MULTIPLIERS], found.shares[0], stds)
+    if not found.sized:
+        stds = np.where([name == TRACK_NAME for name in MULTIPLIERS], found.shares[0], stds)
     stds = stds * configured * factors
     shown = noise(log.runs, found, config.odometry)
     settings: dict[str, float] = {}
-    decisions = [*_geometry(found, config, settings, shown)]
+    decisions = [*_geometry(found, config, settings, shown), *_misread(found)]
     decisions += _noise(found, config, settings, shown)
     decisions += _response(log, config, settings)
     if not settings:
@@ -144,6 +146,24 @@ def _geometry(
         else "A gyro does not show the size of the wheels, so distances are as right as "
         "drive.wheel_radius: measure a straight run with a tape (--distance)."
     )
+
+
+def _misread(found: Fit) -> Iterator[str]:
+    readings = [
+        (abs(float(missed)), reading, piece.run.name)
+        for piece in found.pieces if piece.run.tape
+        for missed, reading in zip(piece.residuals(found.p)["tape"], piece.run.tape, strict=True)
+    ]  # fmt: skip
+    if not readings:
+        return
+    missed, reading, name = max(readings, key=lambda row: row[0])
+    if missed > MISREAD:
+        off = missed * reading.std
+        size = f"{math.degrees(off):.0f} deg" if reading.quantity == "turn" else f"{off:.3f} m"
+        yield (
+            f"Your readings do not fit one track and size: the {reading.quantity} of run {name} is "
+            f"missed by {size}. Was the robot moved by hand, or a distance misread?"
+        )
 
 
 def _noise(found: Fit, config: Config, settings: dict[str, float], shown: Noise) -> Iterator[str]:

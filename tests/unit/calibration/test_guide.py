@@ -7,6 +7,7 @@ import math
 
 import numpy as np
 import pytest
+from msgspec.structs import replace
 
 from acsard.calibration.drive import require_path
 from acsard.calibration.fit import Base
@@ -89,6 +90,30 @@ def test_a_guided_drive_finds_track_and_size_and_stays_on_the_floor(
     edges = [x for place in robot.way for x in (place.real, place.imag)]
     assert SETUP.reach <= min(edges)
     assert max(edges) <= FLOOR_M - SETUP.reach
+
+
+def test_a_distance_that_agrees_with_the_configured_size_does_not_veto_the_track() -> None:
+    robot = Robot(1.6, radius=0.05)
+    robot.method = "gyro"
+    log = guided("gyro", SETUP, robot, robot.ride)
+    (reading,) = log.runs[0].tape
+    for millimetres in range(-6, 7, 3):
+        moved = replace(reading, value=reading.value + millimetres / 1000)
+        runs = replace(log.runs[0], tape=(moved,)), *log.runs[1:]
+        assert calibrate(Log(runs, ()), Config(), "the drive").better, millimetres
+
+
+@pytest.mark.parametrize("misread", ["round", "slowly", "fast"])
+def test_a_turn_that_was_misread_is_named(misread: str) -> None:
+    robot = Robot(1.6)
+    log = guided("tape", SETUP, robot, robot.ride)
+    (turn,) = (run.tape[-1] for run in log.runs if run.name == misread)
+    wrong = [
+        replace(run, tape=(replace(turn, value=turn.value + 0.6),)) if run.name == misread else run
+        for run in log.runs
+    ]
+    with pytest.raises(LogError, match=rf"the turn of run {misread} is missed by \d\d deg"):
+        calibrate(Log(tuple(wrong), ()), Config(), "the drive")
 
 
 @pytest.mark.parametrize("method", METHODS)
