@@ -2,8 +2,7 @@
 
 The parent process imports all modules and collects the tests once, so that a fork starts quickly.
 All tests run once without a change, to measure which blocks of statements each test executes and
-how long it takes. A trial then runs only the tests that reach its change: the tests of its own
-module first, then the others, the fastest first.
+how long it takes. A trial then runs only the tests that reach its change, the fastest first.
 
 If the change is inside of functions, the fork replaces their code objects. If the change is in code
 that an import executes, the fork imports everything again, which takes some seconds longer. A test
@@ -80,12 +79,6 @@ class Trial(NamedTuple):
     lines: frozenset[int]
     text: Callable[[], str]
     first: str = ""
-
-
-def mirror(path: str) -> str:
-    """Return the path of the test module that belongs to a module."""
-    inside = Path(path).relative_to("acsard")
-    return f"tests/unit/{inside.with_name('test_' + inside.name).as_posix()}"
 
 
 def short(test: str) -> str:
@@ -374,9 +367,7 @@ class Trials:
 
     def _chosen(self, trial: Trial, cold: bool) -> list[str]:
         """Return the tests to run, in their order. Before `measure`, only the first is known."""
-        own = mirror(trial.path)
         first = [test for test in self.items if short(test) == trial.first]
-        mine = [test for test in self.items if test.partition("::")[0] == own]
         if not self._seconds:
             return first
         name = trial.path.removesuffix(".py").replace("/", ".")
@@ -394,12 +385,11 @@ class Trials:
             mask |= self._reached.get(place, 0)
         reached = [test for number, test in enumerate(self.items) if mask >> number & 1]
         if cold:
-            reached += mine
             counts = Counter(test.partition("::")[0] for test in reached)
-            files = {own, *(file for file, _ in counts.most_common(MOST_FILES))}
+            files = {file for file, _ in counts.most_common(MOST_FILES)}
             reached = [test for test in reached if test.partition("::")[0] in files]
-        rank = {test: (test not in mine, self._seconds[test]) for test in reached}
-        return first + sorted(rank.keys() - self.failed - {*first}, key=rank.__getitem__)
+        others = {*reached} - self.failed - {*first}
+        return first + sorted(others, key=self._seconds.__getitem__)
 
     def _failing(self, trial: Trial | None, functions: Replacement, tests: list[str]) -> str:
         """Run these tests in another process, until one fails. Return its name, or ""."""
