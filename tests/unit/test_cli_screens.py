@@ -279,7 +279,7 @@ states = st.builds(
 )  # fmt: skip
 
 
-@settings(max_examples=20)
+@settings(max_examples=10)
 @given(states, states | st.none(), st.floats(0, 1e12), anything, st.integers(20, 140))
 def test_any_state_fits_any_terminal_and_is_printable(
     state: RobotState, before: RobotState | None, age: float, text: str, width: int

@@ -42,6 +42,7 @@ from acsard.host.child import (
 )
 from acsard.host.own_identity import own_name, sender_id
 from acsard.host.processes import holder_of, holders, is_running, master_of, name_of, waited_ns
+from tests.each import each
 from tests.system.harness import until
 
 HOLD = """\
@@ -114,39 +115,32 @@ def test_the_other_end_of_a_pty_is_found_and_a_real_device_has_none(device: str)
 
 @pytest.mark.parametrize("path", ["/dev/acsar_that_is_not", "/etc/passwd", "/tmp"])
 def test_a_path_that_is_not_a_device_has_no_holder(path: str) -> None:
-    assert list(holders(path)) == []
-    assert holder_of(path) is None
-    assert master_of(path) is None
+    assert (list(holders(path)), holder_of(path), master_of(path)) == ([], None, None)
 
 
-def test_a_program_is_found_by_its_name(device: str) -> None:
+def test_a_program_is_found_by_its_name_until_it_has_ended(device: str) -> None:
     with another(device) as pid:
         (holder,) = [process for process in holders(device) if process.pid == pid]
         assert is_running(holder.name)
     assert not is_running("no such program")
+    assert (name_of(os.getpid()) != "", name_of(pid)) == (True, "")
 
 
-def test_a_process_that_is_not_there_has_no_name() -> None:
-    ended = subprocess.Popen([sys.executable, "-c", ""])
-    ended.wait()
-    assert name_of(os.getpid()) != ""
-    assert name_of(ended.pid) == ""
-
-
-@pytest.mark.parametrize(
+@each(
     ("command", "name"),
     [
-        (tuple(acsard("run")), "acsard"),
+        (tuple(acsard("run")), "acsard run"),
         (("acsard", "sim"), "acsard"),
-        (("/opt/acsard/0.2.0/bin/acsard", "run"), "acsard"),
-        (("/usr/bin/python3.13", "/opt/acsard/0.2.0/bin/acsard", "run"), "acsard"),
-        (("python", "-m", "acsard", "run"), "acsard"),
+        (("/opt/acsard/0.2.0/bin/acsard", "run", "--config", "x.toml"), "acsard run"),
+        (("/usr/bin/python3.13", "/opt/acsard/0.2.0/bin/acsard", "run"), "acsard run"),
+        (("python", "-m", "acsard", "run"), "acsard run"),
         (("python3", "-PBm", "acsard"), "acsard"),
         (("python3", "-X", "utf8", "-Wignore", "-macsard"), "acsard"),
-        (("python3", "-P", "-X", "utf8", "bin/acsard"), "acsard"),
+        (("python3", "-P", "-X", "utf8", "bin/acsard", "web"), "acsard"),
         (("screen", "-S", "acsard", "/dev/ttyACM0"), "other"),
         (("tail", "-f", "/dev/null", "/tmp/acsard"), "other"),
         (("python3", "logger.py", "acsard"), "other"),
+        (("python3", "-m", "other", "run"), "other"),
         (("python3", "-m", "serial.tools.miniterm", "acsard"), "other"),
         (("python3", "-c", "input()", "acsard"), "other"),
         (("python3", "-X", "acsard"), "other"),
@@ -155,39 +149,16 @@ def test_a_process_that_is_not_there_has_no_name() -> None:
         ((), "other"),
     ],
 )
-def test_only_a_process_that_executes_acsard_has_its_name(
+def test_only_a_process_that_executes_acsard_has_its_name_and_a_daemon_runs_run(
     command: tuple[str, ...], name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(processes, "PROC", tmp_path)
-    (tmp_path / "77").mkdir()
-    (tmp_path / "77" / "cmdline").write_bytes(b"".join(word.encode() + b"\0" for word in command))
-    (tmp_path / "77" / "comm").write_text("other\n")
-    assert name_of(77) == name
-
-
-@pytest.mark.parametrize(
-    ("command", "here"),
-    [
-        (("/opt/acsard/0.2.0/bin/acsard", "run", "--config", "robot.toml"), True),
-        (tuple(acsard("run")), True),
-        (("python3", "bin/acsard", "web"), False),
-        (("python3", "-m", "other", "run"), False),
-        ((), False),
-    ],
-)
-def test_a_daemon_is_here_only_if_its_process_runs_one(
-    command: tuple[str, ...], here: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The page and the daemon in two containers may both have the process id 1."""
     monkeypatch.setattr(processes, "PROC", tmp_path)
-    (tmp_path / "1").mkdir()
+    (tmp_path / "1").mkdir(exist_ok=True)
     (tmp_path / "1" / "cmdline").write_bytes(b"".join(word.encode() + b"\0" for word in command))
-    assert processes.is_daemon_here(1) is here
-
-
-def test_another_program_with_the_word_acsard_keeps_its_own_name() -> None:
-    with subprocess.Popen(["sh", "-c", "read line", "acsard"], stdin=subprocess.PIPE) as process:
-        assert name_of(process.pid) != "acsard"
+    (tmp_path / "1" / "comm").write_text("other\n")
+    assert name_of(1) == name.removesuffix(" run")
+    assert processes.is_daemon_here(1) is name.endswith(" run")
 
 
 def test_the_time_that_a_process_waited_for_a_processor_is_read() -> None:
@@ -256,43 +227,37 @@ def wait_for_end(pid: int) -> None:
 def test_a_run_returns_how_the_child_ended(text: str, code: int, words: str) -> None:
     child = Child(program(text))
     assert (child.run(), child.silent, how_it_ended(code)) == (code, "", words)
-
-
-def test_a_program_that_is_not_there_raises_an_error() -> None:
     with pytest.raises(OSError, match="No such file"):
         Child(["/nowhere/acsard"]).run()
 
 
-def test_a_child_that_is_released_sees_the_end_of_its_input() -> None:
+@pytest.mark.parametrize("early", [True, False])
+def test_a_child_that_is_released_sees_the_end_of_its_input(early: bool) -> None:
     child, codes = Child(program(UNTIL_CLOSED)), []
     thread = threading.Thread(target=lambda: codes.append(child.run()))
+    if early:
+        child.release()
     thread.start()
-    while child._parent_end is None:
+    while child._parent_end is None and not early:
         threading.Event().wait(0.001)
     child.release()
     thread.join(WAIT_S)
     assert codes == [0]
 
 
-def test_a_child_that_is_released_before_its_start_ends_immediately() -> None:
-    child = Child(program(UNTIL_CLOSED))
-    child.release()
-    assert child.run() == 0
-
-
-def test_a_child_without_a_first_sign_of_life_is_killed(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(module, "START_TIMEOUT_NS", 0)
-    child = Child(program("import time; time.sleep(100)"))
-    assert child.run() == -signal.SIGKILL
-    assert "stopped or hung" in child.silent
-
-
-def test_a_stopped_child_without_signs_of_life_is_killed(
-    monkeypatch: pytest.MonkeyPatch,
+@pytest.mark.parametrize(
+    ("text", "timeout"),
+    [
+        ("import time; time.sleep(100)", "START_TIMEOUT_NS"),
+        (ALIVE + "os.kill(os.getpid(), 19)", "SILENCE_TIMEOUT_NS"),
+    ],
+)
+def test_a_child_without_signs_of_life_is_killed(
+    text: str, timeout: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(module, "START_TIMEOUT_NS", 3600 * NS_PER_S)
-    monkeypatch.setattr(module, "SILENCE_TIMEOUT_NS", 0)
-    child = Child(program(ALIVE + "os.kill(os.getpid(), 19)"))
+    monkeypatch.setattr(module, timeout, 0)
+    child = Child(program(text))
     assert child.run() == -signal.SIGKILL
     assert "stopped or hung" in child.silent
 
@@ -326,24 +291,29 @@ def test_the_command_runs_the_installed_package() -> None:
 # the end by signals
 
 
-def test_a_child_that_obeys_is_ended_by_sigterm() -> None:
-    process = started("import time; print(1, flush=True); time.sleep(100)")
-    end(process, WAIT_S)
-    assert process.returncode == -signal.SIGTERM
+SLEEPS = "import signal, time; print(1, flush=True); time.sleep(100)"
 
 
-def test_a_child_that_does_not_obey_is_killed() -> None:
-    ignores = "import signal, time; signal.signal(15, signal.SIG_IGN); print(1, flush=True); "
-    process = started(ignores + "time.sleep(100)")
-    end(process, 0.05)
-    assert process.returncode == -signal.SIGKILL
-
-
-def test_a_child_that_has_ended_is_left_alone() -> None:
-    process = started("print(1, flush=True)")
-    process.wait(WAIT_S)
-    end(process, 0.05)
-    assert process.returncode == 0
+@pytest.mark.parametrize(
+    ("text", "patience_s", "code"),
+    [
+        (SLEEPS, WAIT_S, -signal.SIGTERM),
+        (
+            SLEEPS.replace("print", "signal.signal(15, signal.SIG_IGN); print"),
+            0.05,
+            -signal.SIGKILL,
+        ),
+        ("print(1, flush=True)", 0.05, 0),
+    ],
+)
+def test_a_child_is_ended_by_sigterm_or_killed_and_left_alone_if_it_has_ended(
+    text: str, patience_s: float, code: int
+) -> None:
+    process = started(text)
+    if code == 0:
+        process.wait(WAIT_S)
+    end(process, patience_s)
+    assert process.returncode == code
 
 
 def test_a_child_ends_when_its_parent_is_killed() -> None:

@@ -86,29 +86,21 @@ def test_a_change_through_a_symbolic_link_keeps_the_link(tmp_path: Path) -> None
     assert "trailing_comma = true" in (tmp_path / "real.toml").read_text()
 
 
-def test_a_missing_file_is_reported(tmp_path: Path) -> None:
-    with pytest.raises(MendableError):
-        change(tmp_path / "none.toml", KEYS)
-
-
-def test_a_missing_file_is_created_if_the_caller_permits_it(tmp_path: Path) -> None:
+def test_a_missing_file_is_created_only_if_the_caller_permits_it(tmp_path: Path) -> None:
     file = tmp_path / "acsard.toml"
+    with pytest.raises(MendableError):
+        change(file, KEYS)
     assert change(file, KEYS, new=True) == KEYS
     assert parse(file.read_bytes()).mcu.baud_rate == 57600
     assert file.stat().st_mode & 0o777 == 0o644
     assert os.listdir(tmp_path) == ["acsard.toml"]
 
 
-def test_a_file_with_a_byte_order_mark_is_changed_and_loses_the_mark(tmp_path: Path) -> None:
+def test_new_values_may_be_calculated_from_the_present_ones_and_line_ends_stay(
+    tmp_path: Path,
+) -> None:
     file = tmp_path / "acsard.toml"
     file.write_bytes(b"\xef\xbb\xbf# mine\r\n[mcu]\r\nencoder_counts = 5\r\n")
-    change(file, {"mcu.encoder_counts": 10})
-    assert file.read_bytes() == b"# mine\r\n[mcu]\r\nencoder_counts = 10\r\n"
-
-
-def test_new_values_may_be_calculated_from_the_present_configuration(tmp_path: Path) -> None:
-    file = tmp_path / "acsard.toml"
-    file.write_bytes(b"# mine\r\n[mcu]\r\nencoder_counts = 5\r\n")
     change(file, lambda config: {"mcu.encoder_counts": 2 * config.mcu.encoder_counts})
     assert file.read_bytes() == b"# mine\r\n[mcu]\r\nencoder_counts = 10\r\n"
 
@@ -217,15 +209,10 @@ def fail(*_: object) -> None:
     raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
 
-def test_the_content_is_written_byte_for_byte_and_nothing_else_is_left(file: Path) -> None:
+def test_the_content_is_written_byte_for_byte_with_the_old_mode_or_a_given_one(file: Path) -> None:
     replace(file, NEW)
-    assert file.read_bytes() == NEW
+    assert (file.read_bytes(), mode_of(file)) == (NEW, 0o640)
     assert os.listdir(file.parent) == [file.name]
-
-
-def test_a_file_keeps_its_mode_unless_another_is_given(file: Path) -> None:
-    replace(file, NEW)
-    assert mode_of(file) == 0o640
     replace(file, NEW, mode=0o600)
     assert mode_of(file) == 0o600
 
@@ -251,33 +238,17 @@ def test_a_new_file_can_be_read_by_all_unless_another_mode_is_given(tmp_path: Pa
 
 
 @pytest.mark.skipif(os.geteuid() != 0, reason="only root may give a file away")
-def test_a_file_keeps_its_owner_unless_another_is_given(file: Path) -> None:
+def test_a_file_keeps_its_owner_unless_another_is_given(
+    file: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def owner() -> tuple[int, int]:
+        return file.stat().st_uid, file.stat().st_gid
+
     os.chown(file, 7, 8)
     replace(file, NEW)
-    assert (file.stat().st_uid, file.stat().st_gid) == (7, 8)
+    assert owner() == (7, 8)
     replace(file, NEW, owner=(9, 10))
-    assert (file.stat().st_uid, file.stat().st_gid) == (9, 10)
-
-
-def test_a_replaced_file_of_another_user_belongs_to_the_present_user(
-    file: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def refuse(*_: int) -> None:
-        raise PermissionError(errno.EPERM, os.strerror(errno.EPERM))
-
-    monkeypatch.setattr(os, "fchown", refuse)
-    replace(file, NEW)
-    assert (file.read_bytes(), file.stat().st_uid) == (NEW, os.geteuid())
-    with pytest.raises(PermissionError):
-        replace(file, OLD, owner=(1, 1))
-    assert file.read_bytes() == NEW
-
-
-@pytest.mark.skipif(os.geteuid() != 0, reason="only root may give a file to another group")
-def test_a_file_of_another_user_stays_in_its_group(
-    file: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    os.chown(file, 7, 8)
+    assert owner() == (9, 10)
     fchown = os.fchown
 
     def as_user(handle: int, user: int, group: int) -> None:
@@ -285,9 +256,13 @@ def test_a_file_of_another_user_stays_in_its_group(
             raise PermissionError(errno.EPERM, os.strerror(errno.EPERM))
         fchown(handle, user, group)
 
+    # Another user cannot give the file away, and keeps its group.
     monkeypatch.setattr(os, "fchown", as_user)
     replace(file, NEW)
-    assert (file.stat().st_uid, file.stat().st_gid) == (os.geteuid(), 8)
+    assert owner() == (os.geteuid(), 10)
+    with pytest.raises(PermissionError):
+        replace(file, OLD, owner=(1, 1))
+    assert file.read_bytes() == NEW
 
 
 @pytest.mark.parametrize("call", ["fchmod", "fsync", "replace"])
