@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import tomllib
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +12,8 @@ import zenoh
 
 from acsard.machine.authority import Authority
 from acsard.machine.router_file import router_file
-from tests.system.harness import ROOT, Daemon, Program, acsard
+from tests.system.harness import ROOT, Answered, Bus, Daemon, Program, acsard, client_config
+from tests.system.identities import free_tls_endpoint
 from tests.system.strangers import command_line
 
 FILES = ROOT / "deploy" / "zenoh"
@@ -123,3 +125,69 @@ def router(where: Path, endpoint: str) -> Program:
 def acsard_router(where: Path, endpoint: str) -> Program:
     """Run `acsard router` with that file. Its log says when it listens."""
     return Program(acsard("router", str(write_local_copy(for_two(where), where, endpoint))), where)
+
+
+class Member(Bus):
+    """A plain Zenoh client that shows the router a certificate."""
+
+    def __init__(self, config: zenoh.Config, robot_id: str) -> None:
+        self.session = zenoh.open(config)
+        self.root = f"acsard/{robot_id}"
+
+    def ask(self, key: str, payload: object = None) -> list[Answered]:
+        """Return the robot's own answers to a query.
+
+        They are in JSON. Answers from a storage of the router have the encoding of the message.
+        """
+        answers = []
+        every, data = zenoh.ConsolidationMode.NONE, self.payload(key, payload)
+        asked = f"{self.root}/{key}"
+        for reply in self.session.get(asked, payload=data, consolidation=every, timeout=5.0):
+            if reply.ok is not None and str(reply.ok.encoding).startswith("application/json"):
+                where = str(reply.ok.key_expr).removeprefix(self.root + "/")
+                encoding, value = str(reply.ok.encoding), reply.ok.payload.to_bytes()
+                answers.append(Answered(where, True, encoding, value))
+        return answers
+
+
+class Fleet:
+    """The router, robot1 and robot2, and a plain client on the machine of each robot."""
+
+    def __init__(self, where: Path) -> None:
+        self.where, self.endpoint = where, free_tls_endpoint()
+        names = (*ROBOTS, "viewer", "operator", "maintainer", "unlisted", ITS_NAME)
+        certified(where, *names)
+        self.stack = ExitStack()
+
+    def __enter__(self) -> Fleet:
+        try:
+            self._open()
+        except BaseException:
+            self.__exit__()
+            raise
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.stack.close()
+
+    def _open(self) -> None:
+        enter = self.stack.enter_context
+        enter(router(self.where, self.endpoint)).says("routing")
+        robots = [robot_at(self.endpoint, self.where, name, "peer", ready=False) for name in ROBOTS]
+        self.daemons = [enter(daemon) for daemon in robots]
+        for daemon in self.daemons:
+            daemon.says("bus ")
+        pairs = zip(self.daemons, ROBOTS, strict=True)
+        self.robots = [enter(Bus(daemon.endpoint, name)) for daemon, name in pairs]
+        for robot in self.robots:
+            robot.linked()
+
+    def config(self, name: str) -> zenoh.Config:
+        """Return README.md's settings for all languages, with this certificate."""
+        config = client_config(self.endpoint)
+        config.insert_json5("transport/link/tls", json.dumps(tls_settings(self.where / name)))
+        return config
+
+    def member(self, name: str, robot_id: str = "robot1") -> Member:
+        """Connect a client with this certificate to the router."""
+        return Member(self.config(name), robot_id)

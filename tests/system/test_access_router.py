@@ -1,0 +1,235 @@
+"""Stories of the router of deploy/zenoh with two robots, and its files.
+
+The router is the Zenoh library in router mode with router.json5. Only addresses and files differ,
+and a few lines of code replace the storage plugin. `test_access.py` tries the permissions.
+"""
+
+from __future__ import annotations
+
+import json
+import signal
+import time
+from collections.abc import Iterator
+from functools import partial
+from pathlib import Path
+
+import pytest
+import zenoh
+
+from acsard.client import connect
+from acsard.core.config.contradictions import warnings
+from acsard.core.config.parsing import parse
+from acsard.core.messages.json_schema import SCHEMAS
+from acsard.core.messages.keys_and_roles import SERVICES, TOPICS, WHOAMI, source_keys, whoami_key
+from acsard.core.values import ROLES
+from acsard.host.errors import Exit
+from tests.permissions import FORGED, SOURCES, TWIST
+from tests.promised import PUBLISHED
+from tests.system.fleet_router import ROBOT_FILE, ROBOTS, Fleet, for_two, robot_at
+from tests.system.harness import Bus, acsard, finish, until
+
+pytestmark = pytest.mark.network
+
+ONE, TWO = "acsard/robot1", "acsard/robot2"
+
+
+@pytest.fixture(scope="module")
+def fleet(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Fleet]:
+    with Fleet(tmp_path_factory.mktemp("fleet")) as fleet:
+        yield fleet
+
+
+def test_an_operator_drives_one_robot_and_a_viewer_stops_it(fleet: Fleet) -> None:
+    first, two = fleet.robots
+    with (
+        fleet.member("operator") as operator,
+        fleet.member("viewer") as viewer,
+        viewer.follow("state") as states,
+        operator.commanding(0.3, certificate="operator"),
+    ):
+        states.find(lambda state: (state["linear"] or 0.0) > 0.1, 3.0, "robot1 drives")
+        assert not any(two.state()["wheels"])
+        viewer.put("stop", True)
+        states.find(lambda state: state["mode"] == "stopped", 1.0, "the viewer stopped it")
+        assert not viewer.ask("srv/clear")
+        assert operator.get("srv/clear")["success"]
+    first.at_rest()
+
+
+def test_a_stop_that_a_stalled_robot_reads_after_more_than_two_seconds_stops_it(
+    fleet: Fleet,
+) -> None:
+    with fleet.member("viewer") as viewer, fleet.member("maintainer") as maintainer:
+        until(lambda: viewer.ask("info"), 5.0, "the viewer reaches the robot")
+        robot = fleet.daemons[0]
+        robot.signal(signal.SIGSTOP)
+        try:
+            viewer.put("stop", True)
+            time.sleep(4.0)
+        finally:
+            robot.signal(signal.SIGCONT)
+
+        def stopped() -> bool:
+            return any(b'"mode":"stopped"' in answer.payload for answer in maintainer.ask("state"))
+
+        until(stopped, 5.0, "the stop arrives")
+        assert maintainer.get("srv/clear")["success"]
+
+
+@pytest.mark.parametrize("name", ["operator", "robot1"])
+def test_the_python_client_drives_through_the_router_under_its_certificate_s_name(
+    fleet: Fleet, name: str
+) -> None:
+    tls = str(fleet.where / name)
+    with (
+        fleet.member("viewer") as viewer,
+        viewer.follow("state") as states,
+        connect(fleet.endpoint, robot_id="robot1", tls=tls) as robot,
+    ):
+        robot.drive(0.2, seconds=0.3)
+        driven = {
+            entry.value["sender"] for entry in states.seen if (entry.value["linear"] or 0.0) > 0.1
+        }
+        assert driven == {robot._connection.sender}
+        assert robot._connection.sender.endswith(f" [{name}]")
+
+
+def test_all_robots_are_seen_each_by_its_own_keys(fleet: Fleet) -> None:
+    with fleet.member("viewer") as viewer:
+        for root in (ONE, TWO):
+            state = f"{root}/state"
+            assert [str(r.ok.key_expr) for r in viewer.session.get(state) if r.ok] == [state]
+            tokens = viewer.session.liveliness().get(f"{root}/alive", timeout=5.0)
+            assert [str(r.ok.key_expr) for r in tokens if r.ok] == [f"{root}/alive"]
+
+
+def test_a_robots_certificate_serves_its_own_tree_only(fleet: Fleet) -> None:
+    with fleet.member("robot2") as forger, fleet.member("viewer") as viewer:
+        session = forger.session
+        queryables: list[object] = []
+        for root in (ONE, TWO):
+            key = f"{root}/info"
+
+            def answer(query: zenoh.Query, key: str = key) -> None:
+                query.reply(key, FORGED)
+
+            queryables.append(session.declare_queryable(key, answer))
+        forger.root = TWO
+        forger.ask("info")  # the router has all of the above
+        forged = {root: _forged(viewer.session, f"{root}/info") for root in (ONE, TWO)}
+        assert forged == {ONE: False, TWO: True}
+        del queryables
+
+
+def _forged(session: zenoh.Session, key: str) -> bool:
+    everybody = zenoh.QueryTarget.ALL
+    replies = session.get(
+        key, target=everybody, consolidation=zenoh.ConsolidationMode.NONE, timeout=5.0
+    )
+    return any(reply.ok is not None and reply.ok.payload.to_bytes() == FORGED for reply in replies)
+
+
+def test_on_a_robot_that_is_a_peer_programs_need_no_router_and_reach_no_other_robot(
+    fleet: Fleet,
+) -> None:
+    first, two = fleet.robots
+    with Bus(fleet.daemons[1].endpoint, "robot2") as here, here.commanding(0.1):
+        until(lambda: (here.state()["linear"] or 0.0) > 0.05, 3.0, "robot2 drives")
+        before = first.count("commands")
+        for key in ("cmd/app", "stop"):
+            here.session.put(f"{ONE}/{key}", TWIST)
+        replies = here.session.get(f"{ONE}/srv/stop", timeout=5.0)
+        # On a busy machine Zenoh itself ends a query that nobody answers, with this error.
+        assert {b"Timeout"} >= {
+            (reply.ok or reply.err).payload.to_bytes()  # type: ignore[union-attr]
+            for reply in replies
+        }
+        two.ask("info")
+        sent = first.count("lines_sent")
+        until(lambda: first.count("lines_sent") > sent + 5, 5.0, "five periods")
+        first.comes_to("ready")
+        assert first.count("commands") == before
+    two.at_rest()
+
+
+def test_each_robot_reports_that_its_router_was_found(fleet: Fleet) -> None:
+    for daemon in fleet.daemons:
+        until(partial(daemon.events, "router_found"), 5.0, "the router is reported")
+        assert daemon.events("router_missing") == []
+
+
+def test_a_second_robot_with_the_same_id_ends_with_75(fleet: Fleet) -> None:
+    with robot_at(fleet.endpoint, fleet.where, "robot1", name="twin", ready=False) as twin:
+        assert twin.ended(10.0) == Exit.IN_USE
+    assert "already has the id robot1" in twin.stderr
+    assert fleet.robots[0].state()["link"] == "up"
+
+
+def test_the_tools_join_as_the_manual_says(fleet: Fleet) -> None:
+    where = ["--id", "robot1", "--connect", fleet.endpoint, "--tls", str(fleet.where / "viewer")]
+    echo = finish(acsard("echo", "state", "-n", "1", *where), fleet.where)
+    assert echo.code == 0, echo
+    assert json.loads(echo.out)["mode"] == "ready"
+
+
+# the files
+
+
+def test_the_robot_configuration_of_the_manual_is_valid_without_warnings() -> None:
+    config = parse(ROBOT_FILE.read_bytes())
+    assert not warnings(config)
+    assert config.bus.mode == "client"
+    router = config.bus.connect[0].removeprefix("tls/").partition(":")[0]
+    assert config.access.maintainers == (router,)  # `tls add NAME` makes it valid for that name
+
+
+def test_the_router_names_the_keys_of_the_topic_table_and_the_default_sources(
+    tmp_path: Path,
+) -> None:
+    config = zenoh.Config.from_file(str(for_two(tmp_path)))
+    access = json.loads(config.get_json("access_control"))
+    keys = {rule["id"]: set(rule["key_exprs"]) for rule in access["rules"]}
+    published = {key for row in PUBLISHED for key in (row.key, f"json/{row.key}")}
+    assert keys["hear"] == {f"acsard/*/{key}" for key in published}
+    asked = {topic.key for topic in TOPICS if topic.direction == "query"}
+    asked -= {"schema/<Type>", WHOAMI}
+    asked |= {f"schema/{name}" for name in SCHEMAS} | {whoami_key("viewer")}
+    least: dict[str, str] = {role: whoami_key(role) for role in ROLES}
+    services = {f"srv/{verb}" for verb in SERVICES}
+    commands = set(source_keys(SOURCES, "operator"))
+    for robot in ROBOTS:
+        key_sets = {
+            kind: {key.removeprefix(f"acsard/{robot}/") for key in keys[f"{kind}-{robot}"]}
+            for kind in ("see", "stop", "operate", "slow", "keep", "sense")
+        }
+        key_sets["drive"] = {
+            key.removeprefix(f"acsard/{robot}/")
+            for key in keys["commands of operator"]
+            if key.startswith(f"acsard/{robot}/")
+        }
+        assert key_sets["see"] | key_sets["keep"] >= published | asked | {"alive"}
+        inputs = {"stop", "imu", "speed_limit"}
+        assert set().union(*key_sets.values()) == (
+            published | asked | services | commands | inputs | {"alive", *least.values()}
+        )
+        assert key_sets["drive"] == commands
+        for kind, role in (("see", "viewer"), ("operate", "operator"), ("keep", "maintainer")):
+            assert {key for key in key_sets[kind] if key.startswith("whoami/")} == {least[role]}
+        assert not key_sets["see"] & (commands | services - {"srv/stop"})
+
+
+def test_no_ingress_rule_of_the_router_for_a_person_has_a_wildcard(tmp_path: Path) -> None:
+    config = zenoh.Config.from_file(str(for_two(tmp_path)))
+    access = json.loads(config.get_json("access_control"))
+    rules = {rule["id"]: rule for rule in access["rules"]}
+    people = {"viewers", "operators", "maintainers"}
+    people |= {"certificate operator", "certificate maintainer"}
+    names = {
+        name
+        for policy in access["policies"]
+        if people & set(policy["subjects"])
+        for name in policy["rules"]
+    }
+    ingress = [rules[name] for name in names if "ingress" in rules[name]["flows"]]
+    assert ingress
+    assert not [key for rule in ingress for key in rule["key_exprs"] if "*" in key]
