@@ -250,24 +250,6 @@ async def test_a_token_has_few_connections_and_still_stops_beyond_them(
     assert page.refused()["too_many"] == counted + 2
 
 
-def test_bytes_that_are_not_a_request_get_a_json_error(page: Page, bus: Bus) -> None:
-    counted = page.refused()
-    port = int(page.here.rpartition(":")[2])
-    for request, reason, words in [
-        (b"GET /api/state HTTP/1.1\r\n\r\n", "host", "no `Host`"),
-        (b"\x16\x03\x01\x00\x00 hello\r\n\r\n", "malformed", "not an HTTP request"),
-    ]:
-        with socket.create_connection(("127.0.0.1", port), 30.0) as connection:
-            connection.sendall(request)
-            head, _, body = connection.makefile("rb").read().partition(b"\r\n\r\n")
-        assert head.split()[1] == b"400", head
-        assert b"application/json" in head
-        assert b"nosniff" in head
-        assert words in json.loads(body)["error"]
-        assert page.refused()[reason] == counted.get(reason, 0) + 1
-    assert "Traceback" not in page.stderr
-
-
 PACKED = gzip.compress(b"{}")
 BODIES = {
     "junk as gzip": ("Content-Encoding: gzip\r\nContent-Length: 4", b"abcd"),
@@ -345,27 +327,6 @@ def test_refusals_are_logged_once_a_second_by_reason_and_without_tokens(
     assert " from 127.0.0.1" in lines()[-1]["text"]
     assert len(lines()) - line_count <= time.monotonic() - begun + 1.0
     assert "guessed" not in page.stderr
-
-
-def test_the_log_of_a_refusal_names_the_address_and_the_token_s_name(
-    page: Page, bus: Bus, viewer: str, operator: str
-) -> None:
-    def told(words: str) -> bool:
-        return any(words in line for line in list(page.err) if "page_refused" in line)
-
-    async def story() -> None:
-        async with hands(page, viewer) as theirs, page.client(viewer) as program:
-            await theirs.drive(0.1)
-            async with program.get(f"{page.away}/api/config") as answer:
-                assert answer.status == 403
-        async with hands(page, operator) as ours:
-            await ours.say(cmd={"linear_x": 0.1, "angular_z": 0}, stamp=0)
-            await ours.find(lambda frame: "stamp" in frame.get("reason", ""))
-
-    run(story)
-    until(lambda: told("from 127.0.0.1 (tv)") and told("from 127.0.0.1 (phone)"), 10.0, "named")
-    assert not told(viewer)
-    assert not told(operator)
 
 
 async def test_a_driving_program_that_is_disconnected_gets_a_close_code_and_a_reason(

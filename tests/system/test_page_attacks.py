@@ -311,6 +311,8 @@ def test_a_malformed_request_is_refused_as_a_whole(table: Table, bus: Bus, what:
         opened.sendall(RAW[what].encode("latin-1"))
         answer = opened.recv(4096)
         assert answer.split()[1] == b"400", answer
+        assert b"application/json" in answer
+        assert b"nosniff" in answer
 
 
 def _opened(page: Page) -> socket.socket:
