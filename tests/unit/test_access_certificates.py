@@ -174,27 +174,29 @@ def test_a_key_is_never_readable_by_others_not_even_while_it_is_written(own: Pat
             assert stat.S_IMODE((own / name).stat().st_mode) == 0o600, name
 
 
-def test_a_key_is_not_written_through_a_symbolic_link(own: Path, tmp_path: Path) -> None:
-    elsewhere = tmp_path / "elsewhere"
+# files that already exist
+
+
+def test_init_with_force_makes_a_new_authority_and_prints_what_lets_the_roles_in(
+    own: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    old, elsewhere = certificate(own / "clients/operator"), tmp_path / "elsewhere"
+    # A key is not written through a symbolic link.
     elsewhere.write_text("untouched")
     (own / "key.pem").unlink()
     (own / "key.pem").symlink_to(elsewhere)
     assert tls("init", "--force", "--directory", str(own)) == 0
     assert elsewhere.read_text() == "untouched"
     assert not (own / "key.pem").is_symlink()
-
-
-# files that already exist
-
-
-def test_init_with_force_makes_a_new_authority_that_did_not_sign_old_certificates(
-    own: Path,
-) -> None:
-    old = certificate(own / "clients/operator")
-    assert tls("init", "--force", "--directory", str(own)) == 0
+    authority = certificate(own, "ca.pem")
     with pytest.raises(InvalidSignature):
-        old.verify_directly_issued_by(certificate(own, "ca.pem"))
-    certificate(own / "clients/operator").verify_directly_issued_by(certificate(own, "ca.pem"))
+        old.verify_directly_issued_by(authority)
+    certificate(own / "clients/operator").verify_directly_issued_by(authority)
+    config = parse(tables(capsys.readouterr().out))
+    assert (config.bus.tls, config.bus.insecure) == (str(own), False)
+    assert [endpoint.partition("/")[0] for endpoint in config.bus.listen] == ["tcp", "tls"]
+    assert (config.access.viewers, config.access.operators) == (("viewer",), ("operator",))
+    assert config.access.maintainers == ("maintainer",)
 
 
 def test_add_issues_one_certificate_by_the_same_authority_and_changes_no_file(own: Path) -> None:
@@ -223,18 +225,6 @@ def test_a_certificate_whose_name_looks_like_a_host_is_valid_and_names_its_owner
 
 
 # printed output
-
-
-def test_the_lines_init_prints_are_a_configuration_that_lets_the_roles_in(
-    own: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert tls("init", "--force", "--directory", str(own)) == 0
-    config = parse(tables(capsys.readouterr().out))
-    assert config.bus.tls == str(own)
-    assert not config.bus.insecure
-    assert [endpoint.partition("/")[0] for endpoint in config.bus.listen] == ["tcp", "tls"]
-    assert (config.access.viewers, config.access.operators) == (("viewer",), ("operator",))
-    assert config.access.maintainers == ("maintainer",)
 
 
 @pytest.mark.parametrize(
@@ -337,30 +327,21 @@ def test_init_keeps_a_configuration_s_line_ends_link_and_mode(tmp_path: Path) ->
     assert parse(text).bus.tls == str(tmp_path / "tls")
 
 
-def test_renew_replaces_only_the_robot_s_certificate_and_keeps_its_names(
-    own: Path,
-) -> None:
-    before, old, names = files(own), certificate(own), names_of(own)
-    assert tls("renew", "--directory", str(own), "--days", "40", "--address", "10.0.0.9") == 0
+@pytest.mark.parametrize("name", ["", "robot4"])
+def test_renew_replaces_that_certificate_alone_and_keeps_its_names(own: Path, name: str) -> None:
+    there = ("--directory", str(own))
+    assert tls("add", "robot4", *there, "--address", "10.0.0.4", "--days", "5") == 0
+    place, which = (own / "clients" / name, f"clients/{name}/") if name else (own, "")
+    before, old, names = files(own), certificate(place), names_of(place)
+    words = ("--name", name) if name else ()
+    assert tls("renew", *words, *there, "--days", "40", "--address", "10.0.0.9") == 0
     after = files(own)
-    assert {name for name in after if after[name] != before[name]} == {"certificate.pem", "key.pem"}
-    assert certificate(own).not_valid_after_utc > old.not_valid_after_utc
-    assert names_of(own) == {*names, "10.0.0.9"} > {"localhost", "robot.example", "192.0.2.7"}
-
-
-def test_renew_by_name_replaces_that_certificate_alone_and_keeps_its_addresses(own: Path) -> None:
-    words = ("--directory", str(own))
-    assert tls("add", "robot4", *words, "--address", "10.0.0.4", "--days", "5") == 0
-    place, before = own / "clients" / "robot4", files(own)
-    old, names = certificate(place), names_of(place)
-    assert tls("renew", "--name", "robot4", *words, "--days", "9", "--address", "10.0.0.5") == 0
-    after = files(own)
-    changed = {name for name in after if after[name] != before[name]}
-    assert changed == {"clients/robot4/certificate.pem", "clients/robot4/key.pem"}
-    new = certificate(place)
-    assert common_name(new.subject) == "robot4"
-    assert new.not_valid_after_utc > old.not_valid_after_utc
-    assert names_of(place) == {*names, "10.0.0.5"} >= {"robot4.local", "10.0.0.4"}
+    changed = {file for file in after if after[file] != before[file]}
+    assert changed == {f"{which}certificate.pem", f"{which}key.pem"}
+    assert common_name(certificate(place).subject) == (name or "robot")
+    assert certificate(place).not_valid_after_utc > old.not_valid_after_utc
+    kept = {"robot4.local", "10.0.0.4"} if name else {"localhost", "robot.example", "192.0.2.7"}
+    assert names_of(place) == {*names, "10.0.0.9"} > kept
 
 
 def test_renew_leaves_out_a_name_of_the_machine_that_the_authority_may_not_sign(
@@ -398,12 +379,12 @@ def test_an_encrypted_authority_s_password_is_asked_for(own: Path) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.slow
 def test_an_encrypted_authority_without_a_terminal_is_refused_with_the_reason(own: Path) -> None:
     encrypt(own, b"secret")
     words = [sys.executable, "-m", "acsard", "tls", "renew", "--directory", str(own)]
     done = subprocess.run(words, input="secret\n", capture_output=True, text=True, timeout=30.0)
-    assert done.returncode == Exit.USAGE
-    assert "encrypted" in done.stderr
+    assert (done.returncode, "encrypted" in done.stderr) == (Exit.USAGE, True)
     assert "Traceback" not in done.stderr
 
 
