@@ -707,7 +707,7 @@ class Run:
         if self._flipped:
             self._flipped -= 1
             self.liveness.event(NS // 2)
-            self.spread.trouble(true_ns)
+            self.spread.trouble()
         if not self._plain and gap_ns > 6 * NS // 10:
             # The next good line is the first one with the check, for which the daemon asks again.
             self.liveness.event(NS // 2)

@@ -25,9 +25,9 @@ UNKNOWN_RAD = 1.0
 are larger than those of first order then, make it far too uncertain rather than too certain."""
 
 CALM_NS = 8 * NS // 5
-"""Time after trouble in which the wheels of a side may still seem to slip. One wrong speed affects
-the comparison of the wheels for 0.7 s at 100 Hz, and for 1.05 s at 20 Hz. A slip ends when the
-wheels have agreed for 0.5 s."""
+"""Time of motion after trouble in which the wheels of a side may still seem to slip. One wrong
+speed affects the comparison of the wheels for 0.7 s at 100 Hz, and for 1.05 s at 20 Hz. A slip ends
+when the wheels have agreed for 0.5 s, which wheels at rest do not show."""
 
 SHORTEST_NS = 10_000_000
 """Shortest period in which the counts of an encoder do not look like slip."""
@@ -62,6 +62,7 @@ class Spread:
         self._longest_ns = 2 * max(int(every_s * NS), LEAST_NS)
         """A longer time between two estimates is a gap, in which the covariance grows faster."""
         self._calm_ns = 0
+        """Time of motion until the wheels are certainly calm."""
         self._last: Estimate | None = None
         self._place = self._yaw = 0.0
         """Standard deviation of the position, m, and of the heading, rad: the bounds."""
@@ -70,21 +71,23 @@ class Spread:
         """Note that the next estimate's covariance changes for another reason than motion."""
         self._last = None
 
-    def trouble(self, now_ns: int) -> None:
+    def trouble(self) -> None:
         """Note that a line with a wrong speed may have come now."""
-        self._calm_ns = now_ns + CALM_NS
+        self._calm_ns = CALM_NS
 
     def see(self, now_ns: int, estimate: Estimate, faults: set[str]) -> None:
         """Judge an estimate while the board has these faults."""
         if not self._judged:
             return
         if not faults <= DIALECTS:
-            self.trouble(now_ns)
+            self.trouble()
         last, self._last = self._last, estimate
         if self._rough and last is not None and estimate[0] - last[0] < SHORTEST_NS:
-            self.trouble(now_ns)
+            self.trouble()
         _, x, y, yaw, (xx, _, _, yy, _, yawyaw), _ = estimate
-        if last is None or now_ns < self._calm_ns or estimate[0] - last[0] > self._longest_ns:
+        if last is not None and (x, y, yaw) != last[1:4]:
+            self._calm_ns -= estimate[0] - last[0]
+        if last is None or self._calm_ns > 0 or estimate[0] - last[0] > self._longest_ns:
             self._place, self._yaw = math.sqrt(xx + yy), math.sqrt(yawyaw)
             return
         way = math.hypot(x - last[1], y - last[2])
