@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import random
 from collections import deque
 from collections.abc import Callable
 from typing import Literal, NamedTuple
@@ -42,31 +41,17 @@ class Speaker:
 
     def __init__(self, world: World, way: Way, name: str = "a", ahead: float = 0.0) -> None:
         self.world, self.way, self.name, self.ahead = world, way, name, ahead
-        self.rate = 1.0
-        """The rate of its clock while it is slewed."""
-        self._slewed_ns = world.now_ns
         self._sent = 0
         self.key = "cmd/app"
         self.via: Via = way if way in ("rmw", "bridge") else "native"
         self.session = "session of a router" if way == "routed" else f"session of {name}"
         """The id of the Zenoh session that stamps its messages."""
 
-    def slew(self, rate: float) -> None:
-        """Let the program's clock run at `rate` seconds per second from now on."""
-        self.ahead += (self.rate - 1.0) * (self.world.now_ns - self._slewed_ns) / NS_PER_S
-        self.rate, self._slewed_ns = rate, self.world.now_ns
-
-    @property
-    def gained(self) -> float:
-        """The seconds that the program's clock has gained since the last call of `slew`."""
-        return (self.rate - 1.0) * (self.world.now_ns - self._slewed_ns) / NS_PER_S
-
     def message(self, linear: float) -> Message:
         """Create the next message."""
         self._sent += 1
         world = self.world
-        slewed = (self.rate - 1.0) * (world.now_ns - self._slewed_ns)
-        stamp_ns = int(world.instant.wall_ns + self.ahead * NS_PER_S + slewed)
+        stamp_ns = int(world.instant.wall_ns + self.ahead * NS_PER_S)
         return Message(linear, stamp_ns, self._sent, world.now_ns // 1000)
 
     def deliver(self, message: Message, angular: float = 0.0) -> None:
@@ -92,9 +77,11 @@ class Speaker:
         arrival = Arrival(
             self.key, True, payload, encoding, world.now_ns, told_ns, sender, self.via, attachment
         )
-        arrival = msgspec.structs.replace(arrival, boot_ns=world.now_ns)
-        if not sender and hasattr(arrival, "received_ns"):
-            arrival = msgspec.structs.replace(arrival, received_ns=world.instant.wall_ns)
+        arrival = msgspec.structs.replace(
+            arrival,
+            boot_ns=world.now_ns,
+            received_ns=None if sender else world.instant.wall_ns,
+        )
         world.bus.arrivals.append(arrival)
 
     def send(self, linear: float) -> None:
@@ -169,32 +156,3 @@ def moved(world: World, since_ns: int) -> bool:
     """Return whether the daemon has sent a line with a wheel speed since `since_ns`."""
     still = (b"ap00.00,bp00.00,cp00.00,dp00.00\r\n", b"?\r\n")
     return any(at_ns >= since_ns and line not in still for at_ns, line in world.port.sent)
-
-
-def backlog(dice: random.Random, speaker: Speaker, age: float, span: float, poured: float) -> None:
-    """Deliver a backlog of messages, sent over `span` seconds, the last one `age` seconds ago.
-
-    The backlog arrives within `poured` seconds.
-    """
-    world, hz = speaker.world, dice.choice((10.0, 20.0, 50.0))
-    now_ns, messages = world.now_ns, []
-    zeros = pauses = 0
-    with_zeros, with_pauses = dice.random() < 0.7, dice.random() < 0.4
-    for number in range(max(2, round(span * hz))):
-        world.now_ns = now_ns - int((age + span - number / hz) * NS_PER_S)
-        if (with_zeros and dice.random() < 0.02) or (number == 0 and dice.random() < 0.5):
-            zeros = dice.randrange(1, 20)
-        if with_pauses and dice.random() < 0.01:
-            pauses = dice.randrange(round(hz * 3))
-        pauses -= 1
-        zeros -= 1
-        if pauses < 0:
-            messages.append((number, speaker.message(0.0 if zeros >= 0 else 0.5)))
-    world.now_ns = now_ns
-    heaps = dice.choice((1, 1, 4, 12)) / hz
-    for number, message in messages:
-        due = number / (span * hz) * poured
-        due -= due % heaps if heaps > 1.5 / hz else 0.0
-        world.run(max(0.0, (now_ns - world.now_ns) / NS_PER_S + due))
-        speaker.deliver(message)
-    world.run(0.6)

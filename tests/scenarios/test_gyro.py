@@ -8,7 +8,6 @@ import random
 import pytest
 
 from acsard.core.config.settings import Config, OdometryConfig, SimConfig
-from acsard.core.messages.schema import DiagnosticArray
 from acsard.recording.recorded_steps import StepRecorder
 from tests.scenarios.imperfect_gyro import ImperfectGyro
 from tests.scenarios.world import World
@@ -126,16 +125,6 @@ def test_a_gyro_that_is_40_ms_late_has_a_small_heading_error_too() -> None:
 
 
 @pytest.mark.slow
-def test_the_diagnostics_show_the_bias_of_the_gyro() -> None:
-    made = world()
-    message = made.loop.publication.current("diagnostics")
-    assert isinstance(message, DiagnosticArray)
-    (row,) = [status for status in message.status if status.name == "acsard: gyro"]
-    values = {pair.key: float(pair.value) for pair in row.values}
-    assert values == {"bias_rad_s": pytest.approx(0.01, abs=1e-3)}
-
-
-@pytest.mark.slow
 def test_with_a_gyro_the_position_follows_the_true_one_too() -> None:
     made = world()
     wandering(made, 3, seconds=30.0)
@@ -182,12 +171,3 @@ def test_an_implausible_gyro_sample_is_counted_and_changes_nothing() -> None:
     assert made.state.counters["imu_malformed"] == 1
     assert made.state.gyro == "waiting for turn"
     assert made.state.yaw == 0.0
-
-
-def test_without_the_setting_the_gyro_is_off_and_has_no_diagnostics() -> None:
-    made = World()
-    made.run(1.0)
-    assert made.state.gyro == "off"
-    message = made.loop.publication.current("diagnostics")
-    assert isinstance(message, DiagnosticArray)
-    assert not [status for status in message.status if "gyro" in status.name]

@@ -3,23 +3,12 @@
 from __future__ import annotations
 
 from contextlib import AbstractContextManager
-from typing import TypeVar
 
 import pytest
 
 from acsard.core.config.named_faults import named
-from acsard.core.config.settings import Config, ControlConfig, McuConfig, SimConfig
-from acsard.core.messages.schema import (
-    DiagnosticArray,
-    JointState,
-    Message,
-    Odometry,
-    RobotState,
-    Twist,
-    Vector3,
-)
+from acsard.core.config.settings import Config, ControlConfig, McuConfig
 from acsard.core.simulator.fake_mcu import FakeMcu
-from acsard.core.values import NS_PER_S, Instant, Received
 from tests.scenarios.world import World
 
 ZERO = b"ap00.00,bp00.00,cp00.00,dp00.00\r\n"
@@ -30,16 +19,6 @@ def world() -> World:
     world = World()
     world.run(0.2)
     return world
-
-
-T = TypeVar("T", bound=Message)
-
-
-def current(world: World, key: str, kind: type[T]) -> T:
-    """Return the present value of this key, as a query would receive it."""
-    message = world.loop.publication.current(key)
-    assert isinstance(message, kind)
-    return message
 
 
 def moving(lines: list[bytes]) -> list[bytes]:
@@ -56,57 +35,6 @@ def test_unplugging_is_reported_immediately_and_commands_zero(world: World) -> N
     outputs = world.outputs
     assert outputs is not None
     assert outputs.speeds.as_tuple() == (0.0, 0.0, 0.0, 0.0)
-
-
-@pytest.mark.slow
-def test_a_speed_is_not_reported_after_its_measurements_end(world: World) -> None:
-    world.drive(1.0, seconds=3.0)
-    moving_x = world.state.linear
-    assert moving_x == pytest.approx(1.0, abs=0.05)
-    sampled = world.odom
-    world.port.unplug()
-    world.run(60.0)
-    state = world.state
-    assert (state.linear, state.angular, state.wheels) == (None, None, [])
-    assert state.feedback_age == pytest.approx(60.0, abs=0.02)
-    (age,) = [
-        value.value
-        for row in current(world, "diagnostics", DiagnosticArray).status
-        for value in row.values
-        if value.key == "feedback_age_s"
-    ]
-    assert float(age) == pytest.approx(60.0, abs=0.02)
-    odom = current(world, "odom", Odometry)
-    assert (odom.header, odom.pose) == (sampled.header, sampled.pose)
-    assert odom.twist.twist == Twist(Vector3(), Vector3())
-    assert odom.twist.covariance[::7] == [1e6] * 6
-    wheels = current(world, "wheel_states", JointState)
-    assert (len(wheels.position), wheels.velocity) == (4, [])
-    world.port.plug(world.mcu)
-    world.run(0.5)
-    assert world.state.linear == pytest.approx(0.0, abs=0.05)
-    assert world.state.feedback_age == pytest.approx(0.0, abs=0.02)
-
-
-def test_a_robot_that_never_received_feedback_reports_no_speed_and_no_age() -> None:
-    world = World(plugged=False)
-    world.run(1.0)
-    state = world.state
-    assert (state.linear, state.wheels, state.feedback_age) == (None, [], None)
-
-
-def test_a_port_that_closes_while_it_is_read_is_down_in_the_same_step(world: World) -> None:
-    world.drive(0.5, seconds=1.0)
-    outcomes: list[tuple[str, bytes | None]] = []
-
-    def close(late: Instant | None = None) -> tuple[Received, ...]:
-        world.port.unplug()
-        world.watch = lambda outputs: outcomes.append((outputs.link, outputs.line))
-        return ()
-
-    world.port.take = close  # type: ignore[method-assign]
-    world.run(0.011)
-    assert outcomes[0] == ("down", ZERO)
 
 
 def test_after_replugging_nothing_moves_before_a_zero(world: World) -> None:
@@ -176,15 +104,6 @@ def test_a_long_silence_requires_neutral_again(world: World) -> None:
     assert world.state.code == "neutral"
 
 
-def test_a_zero_from_before_a_long_stall_is_not_neutral_after_it(world: World) -> None:
-    world.drive(0.5, seconds=1.0)
-    world.send(0.0)
-    world.stall(1.2)
-    world.hold(0.5, seconds=1.0)
-    assert world.state.mode == "ready"
-    assert world.state.code == "neutral"
-
-
 def test_a_reset_mcu_does_not_move_before_neutral(world: World) -> None:
     world.drive(0.5, seconds=1.0)
     x = world.state.x
@@ -196,28 +115,6 @@ def test_a_reset_mcu_does_not_move_before_neutral(world: World) -> None:
     assert world.mcu.vehicle.set_points == [0.0] * 4
     assert world.state.x == pytest.approx(x, abs=0.1)
     assert world.state.counters["line_malformed"] >= 1
-
-
-@pytest.mark.parametrize("fault", ["spaces", "trailing_comma", "slow_reply"])
-def test_a_lenient_form_of_reply_changes_nothing(world: World, fault: str) -> None:
-    with getattr(world.mcu, fault)():
-        world.drive(0.5, seconds=2.0)
-        world.send(0.0)
-        world.run(1.0)
-    assert world.state.x == pytest.approx(1.0, rel=0.02)
-    assert not [name for name in world.state.counters if name.startswith("line_")]
-
-
-@pytest.mark.parametrize("fault", ["noise", "partial_line"])
-def test_a_damaged_reply_is_no_feedback(world: World, fault: str) -> None:
-    world.drive(0.5, seconds=1.0)
-    with getattr(world.mcu, fault)():
-        world.hold(0.5, seconds=0.5)
-        assert world.state.link == "stale"
-        assert world.lines()[-1] == ZERO
-    world.hold(0.5, seconds=1.0)
-    assert world.state.link == "up"
-    assert sum(n for k, n in world.state.counters.items() if k.startswith("line_")) >= 1
 
 
 def test_noise_costs_at_most_the_line_it_hits(world: World) -> None:
@@ -273,18 +170,6 @@ def test_blocked_output_is_superseded_and_never_delivered_late(world: World) -> 
     assert len(world.mcu.heard) - before <= 2
 
 
-def test_after_a_long_block_the_robot_starts_over_from_rest(world: World) -> None:
-    world.drive(0.5, seconds=1.0)
-    world.port.blocked = True
-    with world.mcu.free_running(0.05):
-        world.hold(0.5, seconds=0.5)
-        sent = len(world.port.sent)
-        world.port.blocked = False
-        world.hold(0.5, seconds=0.05)
-    first = list(world.port.sent)[sent][1]
-    assert first == ZERO
-
-
 @pytest.mark.parametrize("seconds", [2.0, pytest.param(600.0, marks=pytest.mark.slow)])
 def test_a_blocked_output_is_not_driving_and_requires_neutral_after_a_second(
     seconds: float,
@@ -311,75 +196,6 @@ def test_a_blocked_output_is_not_driving_and_requires_neutral_after_a_second(
         assert (world.state.mode, world.state.link) == ("ready", "up")
         world.drive(0.5, seconds=0.5)
         assert world.state.mode == "driving"
-
-
-def test_a_short_blocked_output_only_ramps_up_again() -> None:
-    world = World(Config(mcu=McuConfig(reply_period=0.05)))
-    with world.mcu.free_running(0.05):
-        world.run(0.5)
-        world.drive(0.5, seconds=1.0)
-        world.port.blocked = True
-        world.hold(0.5, seconds=0.7)
-        assert world.state.mode == "waiting"
-        world.port.blocked = False
-        world.hold(0.5, seconds=0.3)
-        assert world.state.mode == "driving"
-
-
-def test_an_output_that_is_blocked_from_the_opening_on_is_reported_before_the_link_is_up() -> None:
-    world = World(Config(mcu=McuConfig(reply_period=0.2)), plugged=False)
-    world.port.blocked = True
-    with world.mcu.free_running(0.2):
-        world.port.plug(world.mcu)
-        world.run(4.0)
-        assert (world.state.mode, world.state.link) == ("waiting", "booting")
-        assert world.state.code == "port_blocked"
-        (event,) = [event for event in world.events if event.code == "port_blocked"]
-        assert (event.name, event.level) == ("link_booting", "warning")
-        world.port.blocked = False
-        world.run(1.0)
-        assert world.state.link == "up"
-
-
-def test_the_first_line_after_a_reopening_is_zero_even_when_the_output_was_blocked() -> None:
-    world = World(plugged=False)
-    world.run(0.1)
-    world.port.blocked = True
-    with world.mcu.free_running(0.02):
-        world.port.plug(world.mcu)
-        world.run(0.1)
-        world.drive(0.5, seconds=0.1)
-        world.port.blocked = False
-        world.run(0.1)
-        assert world.state.link == "up"
-        world.drive(0.5, seconds=0.2)
-    assert world.lines()[0] == ZERO
-    assert moving(world.lines())
-
-
-def test_a_line_that_a_stall_in_the_step_delays_is_superseded_by_the_next_one(
-    world: World,
-) -> None:
-    world.drive(0.5, seconds=0.2)  # on the way up each line has another speed
-    made: list[bytes | None] = []
-    world.watch = lambda outputs: made.append(outputs.line) if outputs.due else None
-    sent = len(world.port.sent)
-    world.stall_in_step(0.015)
-    world.run(0.1)
-    old, *fresh = made
-    assert [line for _, line in list(world.port.sent)[sent:]] == fresh
-    assert len({old, *fresh}) == 1 + len(fresh) >= 8
-    assert world.state.counters["lines_superseded"] == 1
-
-
-def test_a_zero_line_is_sent_however_long_the_step_stalled(world: World) -> None:
-    sent, begun_ns = len(world.port.sent), world.now_ns
-    world.stall_in_step(0.2)
-    world.run(0.2)
-    (late_ns, line), *_ = list(world.port.sent)[sent:]
-    assert line == ZERO
-    assert late_ns >= begun_ns + NS_PER_S // 5
-    assert world.state.counters.get("lines_superseded", 0) == 0
 
 
 def test_a_torn_line_moves_nothing_and_spoils_no_later_line(world: World) -> None:
@@ -457,11 +273,6 @@ def test_a_stall_of_this_computer_does_not_stop_the_robot_without_a_ramp(stall: 
         assert b"ap00.00" not in b"".join(line for _, line in list(world.port.sent)[lines:])
 
 
-def test_the_mcu_watchdog_is_fed_while_the_host_lives(world: World) -> None:
-    world.drive(0.5, seconds=5.0)
-    assert world.mcu.watchdog_trips == 0
-
-
 def test_the_mcu_stops_the_motors_by_itself_when_the_host_dies(world: World) -> None:
     world.drive(0.5, seconds=1.0)
     world.mcu.advance(world.now_ns + 400_000_000)
@@ -478,31 +289,6 @@ def test_a_link_that_loses_lines_is_reported_once(fault: str) -> None:
     events = [event for event in world.events if event.name == "lines_lost"]
     assert [event.level for event in events] == ["warning"]
     assert "answered only" in events[0].text
-
-
-@pytest.mark.slow
-def test_a_sound_link_is_not_reported_to_lose_lines() -> None:
-    world = World()
-    world.drive(0.5, seconds=25.0)
-    assert not [event for event in world.events if event.name == "lines_lost"]
-    assert "link_lost" not in world.state.counters
-
-
-def test_each_silence_of_a_board_is_counted() -> None:
-    world = World()
-    with world.mcu.switched_on(named("stalls=1:0.3")):
-        world.run(5.5)
-    assert world.state.counters["link_lost"] == 5
-
-
-def test_a_simulator_that_is_configured_mute_never_brings_the_link_up() -> None:
-    world = World(Config(sim=SimConfig(faults=("mute",))), wanted={"state"})
-    world.run(10.0)
-    states = [
-        message for message in world.bus.published["state"] if isinstance(message, RobotState)
-    ]
-    assert {state.link for state in states} == {"booting"}
-    assert world.mcu.valid_lines > 0
 
 
 @pytest.mark.parametrize(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import msgspec
 import pytest
 from msgspec.structs import replace
 
@@ -11,8 +10,7 @@ from acsard.core.config.settings import Config
 from acsard.core.link.serial_output import Offered
 from acsard.core.robot import Robot
 from acsard.core.values import Instant
-from acsard.recording.replay import Replay, max_wheel_speed
-from acsard.recording.state import thaw
+from acsard.recording.replay import Replay
 from tests.scenarios.taped import (
     INPUTS,
     WITH_ARGUMENTS,
@@ -54,28 +52,6 @@ def lives_again(tape: Tape, config: Config, first: int = 0, least: int = 100) ->
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("after", [0.1, 0.5, 1.2])
-def test_a_recording_that_begins_in_a_ramp_stores_when_the_ramp_was_commanded(after: float) -> None:
-    """A recording begins during a ramp to zero, and its state has the time of the command.
-
-    So the guard in the replay allows the rest of the ramp, and refuses a moving line after it.
-    """
-    tape, world = recorded_world()
-    world.drive(1.0, seconds=2.0)
-    world.run(after)
-    tape.cut = True
-    world.run(2.0)
-    (first,) = tape.states
-    lives_again(tape, PLAIN, first)
-    assert thaw(tape.states[first]).memory.commanded_ns is not None
-    late = replayed(tape, PLAIN, first)
-    guard, robot, now_ns = late._guard, late.robot, tape.taken[-1].now.mono_ns
-    moving = b"ap01.00,bp01.00,cp01.00,dp01.00\r\n"
-    guard.record_written(moving)
-    assert guard.check(moving, now_ns, robot.status, robot.command_ns)[1] == "guard_too_long"
-
-
-@pytest.mark.slow
 @pytest.mark.parametrize(
     "config",
     [
@@ -93,57 +69,10 @@ def test_a_drive_through_every_fault_is_replayed_to_the_last_bit(config: Config)
     lives_again(tape, config)
 
 
-@pytest.mark.slow
-def test_settings_that_were_changed_during_the_recording_are_replayed_too() -> None:
-    tape, world = recorded_world(PLAIN)
-    world.drive(0.5, seconds=1.0)
-    world.call("stop")
-    world.run(2.0)
-    settings = {"limits.wheel_speed": 60.0, "limits.linear_speed": 2.5}
-    assert world.call("set", msgspec.json.encode({"settings": settings})).success
-    tape.cut = True
-    world.call("clear")
-    (first,) = tape.states
-    world.drive(2.5, seconds=4.0)
-    fastest = max(max_wheel_speed(step.line) for step in tape.taken)
-    assert fastest > PLAIN.limits.wheel_speed * 100
-    lives_again(tape, PLAIN)
-    lives_again(tape, PLAIN, first)
-
-
-@pytest.mark.slow
-def test_a_replay_can_begin_at_any_saved_state_of_a_drive_with_faults() -> None:
-    tape, world = recorded_world(FULL, every=397)
-    drive_through_faults(world, 20.0)
-    assert len(tape.states) > 5
-    for first in tape.states:
-        lives_again(tape, FULL, first, 1)
-
-
-@pytest.mark.soak
-@pytest.mark.timeout(1200)
-def test_ten_minutes_through_every_fault_are_replayed() -> None:
-    lives_again(taped(FULL, 600.0), FULL)
-
-
 @pytest.mark.soak
 @pytest.mark.timeout(7200)
 def test_an_hour_through_every_fault_is_replayed() -> None:
     lives_again(taped(PLAIN, 3600.0), PLAIN)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("config", [PLAIN, FULL], ids=["plain", "checked, counted, with a gyro"])
-def test_a_recording_that_begins_in_a_drive_is_replayed_from_its_first_state(
-    config: Config,
-) -> None:
-    tape, world = recorded_world(config)
-    world.drive(0.6, 0.4, seconds=2.0)
-    tape.cut = True
-    world.hold(0.6, -0.4, seconds=3.0)
-    (first,) = tape.states
-    assert tape.taken[first].status.mode == "driving"
-    lives_again(tape, config, first)
 
 
 def test_a_replay_counts_lines_and_commands_as_the_daemon_did() -> None:
@@ -222,28 +151,3 @@ def test_a_replay_with_other_limits_reports_the_first_line_that_differs() -> Non
     assert first.what == ("line", "sent line")
     assert first.recorded.status.mode == first.replayed.status.mode == "driving"
     assert comparison.max_wheel_speeds == (1000, 600)  # 0.5 and 0.3 m/s on wheels of 0.05 m
-
-
-@pytest.mark.slow
-def test_a_replay_may_change_the_limits_in_the_middle_of_a_drive() -> None:
-    """The wheels are those of the recording, and turn as fast as they did.
-
-    After 0.8 s of lines that are slower, they have rolled too far, and the replayed robot latches.
-    """
-    tape, world = recorded_world()
-    world.drive(0.5, 0.3, seconds=2.0)
-    tape.cut = True
-    world.hold(0.5, 0.3, seconds=0.7)
-    (first,) = tape.states
-    replay = Replay(*thaw(tape.states[first], SLOW_LIMITS))
-    for step in tape.steps(first):
-        replay.step(step)
-    comparison = replay.comparison
-    assert comparison.modes_same == comparison.steps
-    assert comparison.first is not None
-    line = tape.steps(first)[-1].recorded.line
-    assert line is not None
-    last = replay.step(tape.steps(first)[-1])
-    assert last is not None
-    assert last.replayed.line is not None
-    assert last.replayed.line < line  # slower, both forwards

@@ -10,11 +10,9 @@ import random
 from collections.abc import Callable
 from typing import Literal
 
-import msgspec
 import pytest
 
 from acsard.core.config.settings import Config
-from acsard.core.incoming.commands import Arrival
 from acsard.core.messages.signature import public_name
 from acsard.core.robot import Robot
 from acsard.core.values import NS_PER_S, Cause, Event, Instant, Latches
@@ -23,7 +21,7 @@ from acsard.daemon.latch_file import Keeper, LatchFileError, decode, encode, unr
 from acsard.daemon.publication import Publication
 from tests.each import each
 from tests.scenarios.speakers import Speaker, moved
-from tests.scenarios.test_diagnostics import row
+from tests.scenarios.test_state import row
 from tests.scenarios.world import SIGNED, START, World
 
 Kind = Literal["stop", "fault", "inactive"]
@@ -171,16 +169,6 @@ def test_a_robot_whose_latch_file_is_truncated_stands_until_a_clear(kind: Kind) 
     stands_until_released(Host(random.Random(2)), kind, cut)
 
 
-@pytest.mark.parametrize(
-    "count", [pytest.param(10, marks=pytest.mark.slow), pytest.param(200, marks=pytest.mark.soak)]
-)
-@pytest.mark.timeout(1200)
-def test_no_restart_moves_a_latched_robot(count: int) -> None:
-    dice = random.Random(27)
-    for _ in range(count):
-        stands_until_released(Host(dice), dice.choice(KINDS), dice.choice((whole, cut)))
-
-
 def test_state_and_diagnostics_say_that_a_stop_would_be_lost() -> None:
     host = Host(random.Random(10))
     host.world.run(1.5)
@@ -191,33 +179,6 @@ def test_state_and_diagnostics_say_that_a_stop_would_be_lost() -> None:
     assert host.world.state.latch_file_error == host.file.trouble
     assert row(host.world, "latch file").level == 1
     assert row(host.world, "latch file").message == host.file.trouble
-
-
-def test_an_event_of_the_latch_file_reaches_the_log() -> None:
-    host = Host(random.Random(11))
-    event = Event("latch_file", "a stop would not survive a restart: FILE: full", "warning")
-    host.file.told.append(event)
-    host.world.run(0.1)
-    assert event in host.world.events
-
-
-@pytest.mark.slow
-def test_a_fault_over_a_stop_takes_two_plain_clears_after_a_restart_as_before() -> None:
-    host = Host(random.Random(3))
-    host.patrols(2 * CYCLE_S)
-    host.latch("fault")
-    assert host.world.call("stop").success
-    host.restart()
-    host.patrols(2 * CYCLE_S)
-    assert host.world.state.mode == "fault"
-    host.world.ask("srv/clear")
-    assert host.world.state.mode == "stopped"
-    host.restart()
-    host.patrols(2 * CYCLE_S)
-    assert host.world.state.mode == "stopped"
-    host.world.ask("srv/clear")
-    host.patrols(2 * CYCLE_S)
-    assert host.world.state.mode == "driving"
 
 
 @pytest.mark.slow
@@ -232,14 +193,6 @@ def test_a_plain_clear_waits_two_seconds_after_a_reboot_wherever_its_clock_is(aw
     world.run(1.6)
     world.ask("srv/clear")
     assert world.state.mode == "ready"
-
-
-def test_a_set_lasts_until_the_restart() -> None:
-    host = Host(random.Random(4))
-    payload = msgspec.json.encode({"settings": {"limits.linear_speed": 0.2}})
-    assert host.world.call("set", payload).success
-    host.restart()
-    assert host.world.loop.robot.config == Config()
 
 
 def test_a_stop_is_obeyed_immediately_and_answered_after_the_file_is_written() -> None:
@@ -260,18 +213,6 @@ def test_a_stop_is_answered_within_0_2_s_however_slow_the_disk_is() -> None:
     host.file.is_stored = False
     assert not host.world.ask("srv/stop")
     host.world.run(0.2)
-    (replies,) = host.world.bus.replies.values()
-    assert len(replies) == 1
-
-
-def test_a_stream_of_stops_delays_no_answer_to_another_request() -> None:
-    host = Host(random.Random(12))
-    host.world.run(0.5)
-    host.file.is_stored = False
-    assert not host.world.ask("srv/reset_odometry")
-    for _ in range(25):
-        host.world.put("stop", b"")
-        host.world.run(0.01)
     (replies,) = host.world.bus.replies.values()
     assert len(replies) == 1
 
@@ -299,16 +240,6 @@ def test_the_answers_before_the_exit_wait_a_limited_time_for_the_file(hangs: boo
     assert host.file.waited == 1
     (replies,) = host.world.bus.replies.values()
     assert len(replies) == 1
-
-
-def test_a_stop_while_the_bus_closes_is_in_force_at_the_next_start() -> None:
-    host = Host(random.Random(15))
-    host.world.loop.finish(host.world.instant)
-    host.world.bus.arrivals.append(Arrival("stop", True, b"", "", host.world.now_ns, None, ""))
-    host.world.loop.keep_last_stops(host.world.instant)
-    host.restart()
-    host.patrols(CYCLE_S)
-    assert host.world.state.mode == "stopped"
 
 
 @pytest.mark.variations(4)
@@ -355,22 +286,9 @@ def test_a_stop_in_a_step_that_raises_is_in_force_at_the_next_start(
     assert f"stopped by {client} (native)" in host.world.state.reason
 
 
-def test_a_stop_during_the_shutdown_is_in_force_at_the_next_start() -> None:
-    host = Host(random.Random(5))
-    host.patrols(2 * CYCLE_S)
-    host.world.loop.shutting_down = True
-    host.patrols(0.1)
-    host.world.put("stop", b"")
-    assert host.world.state.mode == "shutdown"
-    host.restart()
-    host.patrols(2 * CYCLE_S)
-    assert host.world.state.mode == "stopped"
-
-
-def test_a_stop_after_the_last_step_is_in_force_at_the_next_start() -> None:
-    host = Host(random.Random(6))
-    host.world.bus.arrivals.append(Arrival("stop", True, b"", "", host.world.now_ns, None, ""))
-    host.world.loop.finish(host.world.instant)
-    host.restart()
-    host.patrols(CYCLE_S)
-    assert host.world.state.mode == "stopped"
+def test_an_event_of_the_latch_file_reaches_the_log() -> None:
+    host = Host(random.Random(11))
+    event = Event("latch_file", "a stop would not survive a restart: FILE: full", "warning")
+    host.file.told.append(event)
+    host.world.run(0.1)
+    assert event in host.world.events

@@ -1,7 +1,7 @@
 """The covariance contains the errors of bursts of 0.1 to 0.5 s without plain lines.
 
 Run it with `pytest -s -m soak core/link/test_bursts.py`. `test_line_time.py` tests the pose error
-after 450 m, and `scenarios/test_bursts.py` tests boards that send counts.
+after 450 m, and `scenarios/test_pose_bursts.py` tests boards that send counts.
 """
 
 from __future__ import annotations

@@ -5,7 +5,6 @@ from __future__ import annotations
 import itertools
 import math
 import random
-from collections import Counter
 from contextlib import nullcontext
 from itertools import product
 
@@ -135,15 +134,6 @@ def test_one_count_is_no_impossible_speed_although_it_looks_faster_than_the_boun
     assert world.state.counters.get("line_implausible", 0) <= 10
 
 
-@pytest.mark.slow
-def test_minutes_of_varied_driving_raise_no_false_alarm(world: World) -> None:
-    for i in range(30):
-        world.hold((-1) ** i * 0.9, (i % 7 - 3) * 1.2, seconds=0.5 + i % 5 * 0.8, hz=10.0)
-        world.send(0.0)
-        world.run(0.2 + i % 3)
-    assert "fault" not in {event.name for event in world.events}
-
-
 # damage
 
 
@@ -181,19 +171,15 @@ TENS, ONES = (2, 10, 18, 26), (3, 11, 19, 27)
 """Places of the tens and of the ones digits of the four speeds in a reply."""
 
 FLIPS = [(TENS[0], 8), (TENS[1], 1), (ONES[2], 8), (ONES[3], 2)]
-ALL_FLIPS = [(place, 1 << bit) for place in range(33) for bit in range(8)]
 
 
 @pytest.mark.variations(6)
 @pytest.mark.parametrize("drives", [False, True])
 @pytest.mark.parametrize("silence", [0.06, 0.2, 0.3, 0.6, 0.9])
-@pytest.mark.parametrize(
-    "flips", [FLIPS, pytest.param(ALL_FLIPS, marks=pytest.mark.soak)], ids=["some", "all"]
-)
 def test_a_bit_flipped_in_the_first_line_after_a_silence_is_in_the_covariance(
-    drives: bool, silence: float, flips: list[tuple[int, int]]
+    drives: bool, silence: float
 ) -> None:
-    for place, bits in [(0, 0), *flips]:
+    for place, bits in [(0, 0), *FLIPS]:
         world = World()
         world.run(1.0)
         if drives:
@@ -208,36 +194,6 @@ def test_a_bit_flipped_in_the_first_line_after_a_silence_is_in_the_covariance(
         p = world.odom.pose.covariance
         assert metres < max(0.03, 3.0 * math.sqrt(p[0] + p[7]))
         assert turned < max(0.06, 3.0 * math.sqrt(p[35]))
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("number", [1, 2, 3, 4])
-def test_a_bit_flipped_while_the_link_returns_is_no_fault(number: int) -> None:
-    world = World()
-    world.run(1.0)
-    for _ in range(3):  # the quantization steps are learned
-        world.drive(0.5, 0.5, seconds=1.0)
-        world.run(1.5)
-    damage(world, 0.3, number, TENS[0], 8)
-    world.run(2.0)
-    assert (world.state.mode, event_texts(world, "fault")) == ("ready", [])
-
-
-@pytest.mark.slow
-def test_a_bit_error_in_the_first_line_after_clear_is_no_fault_and_turns_no_pose(
-    world: World,
-) -> None:
-    for _ in range(3):
-        world.drive(0.5, 0.5, seconds=1.0)
-        world.run(1.5)
-    world.put("stop", b"")
-    world.run(2.5)
-    yaw = world.state.yaw
-    damage(world, 0.0, 1, TENS[0], 8)
-    assert world.call("clear").success
-    world.run(1.0)
-    assert (world.state.mode, event_texts(world, "fault")) == ("ready", [])
-    assert world.state.yaw == pytest.approx(yaw, abs=0.01)
 
 
 # hands
@@ -298,18 +254,10 @@ def shove(world: World, mode: str, dice: random.Random) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "count",
-    [
-        8,
-        pytest.param(40, marks=pytest.mark.nightly),
-        pytest.param(1000, marks=[pytest.mark.soak, pytest.mark.timeout(1800)]),
-    ],
-)
-def test_no_hand_latches_a_fault_whatever_the_mode(count: int, world: World) -> None:
-    dice, kinds = random.Random(7), Counter[str]()
+def test_no_hand_latches_a_fault_whatever_the_mode(world: World) -> None:
+    dice = random.Random(7)
     modes = ("ready", "inactive", "stopped", "fault", "driving")
-    for trial in range(count):
+    for trial in range(8):
         mode = modes[trial % len(modes)]
         enter(world, mode, dice)
         world.events.clear()
@@ -319,13 +267,9 @@ def test_no_hand_latches_a_fault_whatever_the_mode(count: int, world: World) -> 
         assert (world.state.mode, latched) == (mode, []), f"push {trial} in {mode}: {latched}"
         resisting = mode == "driving" and world.state.code == "zeros"
         assert mode == "ready" or resisting or world.state.reason == reason
-        kinds[mode] += 1
         world.run(0.5)
         leave(world, mode)
         world.port.sent.clear()
-    print(
-        f"\nhands: {dict(kinds)}, seen {world.state.counters['uncommanded_motion']} times, no fault"
-    )
 
 
 @pytest.mark.parametrize("mode", ["ready", "inactive", "stopped"])
@@ -343,70 +287,6 @@ def test_wheels_turned_by_hand_are_reported_at_most_once_a_second_and_counted(
     leave(world, mode)
     world.drive(0.5, seconds=1.0)
     assert world.state.mode == "driving"
-
-
-ONE_OF_EACH = {(0.2, "zero"), (0.4, "stop"), (0.6, "silence")}
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("lag", "way"),
-    [
-        pytest.param(*case, marks=[] if case in ONE_OF_EACH else pytest.mark.slow)
-        for case in product((0.05, 0.2, 0.4, 0.6), ("stop", "silence", "zero"))
-    ],
-)
-def test_motors_that_are_slow_to_stop_are_no_runaway_and_no_hand(lag: float, way: str) -> None:
-    world = World(Config(sim=SimConfig(motor_time_constant=lag)))
-    world.run(0.2)
-    for linear, angular in ((1.0, 0.0), (-1.0, 1.0), (0.0, 4.0), (0.3, 0.0)):
-        world.drive(linear, angular, seconds=3.0)
-        assert world.state.mode == "driving"
-        if way == "stop":
-            world.put("stop", b"")
-        elif way == "zero":
-            world.hold(0.0, seconds=2.0)
-        world.run(3.0)
-        if way == "stop":
-            assert world.call("clear").success
-    assert event_texts(world, "fault") == event_texts(world, "uncommanded_motion") == []
-
-
-INTERRUPTIONS = (
-    ("clear", 0.05), ("clear", 0.1), ("clear", 0.2),
-    ("silence", 0.12), ("silence", 0.2), ("replug", 0.05), ("replug", 0.3),
-)  # fmt: skip
-
-
-@pytest.mark.variations(7)
-@pytest.mark.parametrize(
-    ("lag", "interruption"),
-    [
-        pytest.param(*case, marks=[] if case[0] == 0.4 else pytest.mark.slow)
-        for case in product((0.3, 0.35, 0.4, 0.45, 0.5, 0.6), INTERRUPTIONS)
-    ],
-)
-def test_motors_that_lag_are_no_runaway_when_the_daemon_has_forgotten_their_speed(
-    lag: float, interruption: tuple[str, float]
-) -> None:
-    kind, seconds = interruption
-    for linear, angular in ((1, 0), (-1, 1), (0.5, 0), (0, 4), (0.7, -2), (-0.3, 0)):
-        world = World(Config(sim=SimConfig(motor_time_constant=lag)))
-        world.run(0.2)
-        world.drive(linear, angular, seconds=1.7)
-        if kind == "clear":
-            world.put("stop", b"")
-            world.run(seconds)
-            assert world.call("clear").success
-        elif kind == "silence":
-            with world.mcu.mute():
-                world.run(seconds)
-        else:
-            world.port.unplug()
-            world.run(seconds)
-            world.port.plug(world.mcu)
-        world.run(2.0)
-        assert event_texts(world, "fault") == []
 
 
 @pytest.mark.variations(3)
@@ -466,32 +346,3 @@ def test_a_runaway_that_is_cleared_while_it_lasts_is_detected_again(world: World
         assert world.call("clear").success
         world.run(1.0)
         assert world.state.mode == "fault"
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("lag", [0.05, 0.2])
-def test_the_sparsest_allowed_feedback_raises_no_false_alarm_even_with_lost_lines(
-    lag: float,
-) -> None:
-    config = Config(mcu=McuConfig(reply_period=0.25), sim=SimConfig(motor_time_constant=lag))
-    assert contradictions(config) == []
-    world, dice = World(config), random.Random(3)
-    with world.mcu.free_running(0.25), world.mcu.lost_replies(3):
-        world.run(3.0)
-        world.send(0.0)
-        world.run(0.1)
-        for _ in range(20):
-            linear = dice.choice((-1, 1)) * dice.uniform(0.3, 1.0)
-            world.hold(linear, dice.uniform(-3, 3), seconds=dice.uniform(0.4, 3.0))
-            assert world.state.mode == "driving"
-            world.send(0.0)
-            world.run(dice.uniform(0.3, 1.5))
-    assert event_texts(world, "fault") == event_texts(world, "uncommanded_motion") == []
-
-
-def test_a_robot_that_may_not_turn_drives_straight_on() -> None:
-    world = World(Config(limits=LimitsConfig(angular_speed=0.0)))
-    world.run(0.2)
-    world.drive(0.5, 0.001, seconds=2.0)
-    assert world.state.mode == "driving"
-    assert (world.state.linear, world.state.yaw) == pytest.approx((0.5, 0.0), abs=0.02)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from itertools import pairwise
 from typing import Any
 
 import msgspec
@@ -12,7 +11,6 @@ from acsard.core.config.settings import Config
 from acsard.core.messages.schema import ServiceReply
 from acsard.core.values import Plain
 from tests.each import each
-from tests.scenarios.taped import Tape, replayed
 from tests.scenarios.test_restart import MemoryFile
 from tests.scenarios.world import START, World
 from tests.stepped import Outputs
@@ -70,16 +68,6 @@ def test_a_zone_slows_the_robot_and_its_end_lets_it_go_on_as_before(world: World
     assert all(event.by.endswith(" on the key speed_limit") for event in events)
 
 
-def test_the_robot_slows_down_by_its_deceleration_while_it_keeps_driving(world: World) -> None:
-    world.drive(1.0, seconds=2.0)
-    speeds = fastest(world)
-    limit(world, 0.4)
-    world.hold(1.0, seconds=1.5)
-    assert world.state.mode == "driving"
-    assert max(a - b for a, b in pairwise(speeds)) < 0.02
-    assert speeds[-1] == pytest.approx(0.4)
-
-
 @pytest.mark.slow
 @each("first", ["limit", "set"])
 @each("value", [0.2, 0.5])
@@ -101,17 +89,6 @@ def test_the_lower_of_a_speed_limit_and_a_setting_wins_in_either_order(
     speeds = fastest(world)
     world.hold(1.0, seconds=1.5)
     assert max(speeds) == pytest.approx(0.3)
-
-
-def test_no_line_is_faster_than_the_limit_when_an_operator_sets_more(world: World) -> None:
-    limit(world, 0.3)
-    world.drive(1.0, seconds=1.0)
-    speeds = fastest(world)
-    reply = sets(world, limits__linear_speed=1.5)
-    assert reply.success
-    world.hold(1.0, seconds=1.0)
-    assert max(speeds) <= 0.3 + 1e-9
-    assert "; back to 1.5 m/s when this limit ends" in world.state.speed_limit
 
 
 @each(
@@ -159,33 +136,3 @@ def test_a_percentage_is_a_share_of_the_configured_speed(world: World) -> None:
     assert sets(world, limits__linear_speed=0.6).success
     limit(world, 50.0, percentage=True)
     assert world.state.speed_limit.startswith("0.5 m/s, ")
-
-
-def test_a_flood_of_limits_is_few_lines_in_the_log_and_the_newest_counts(world: World) -> None:
-    world.run(1.0)
-    for number in range(200):
-        world.put("speed_limit", b'{"speed_limit": %f}' % (0.2 + 0.001 * number))
-        world.run(0.01)
-    world.run(1.1)
-    lines = [event for event in world.events if event.name == "speed_limit"]
-    assert sum(event.count for event in lines) == 200
-    assert len(lines) <= 9
-    assert world.state.speed_limit.startswith("0.399 m/s, ")
-
-
-@pytest.mark.slow
-def test_a_drive_through_a_zone_is_replayed_to_the_last_bit() -> None:
-    tape = Tape()
-    world = World(recorder=tape)
-    world.run(0.2)
-    world.drive(0.8, seconds=1.0)
-    limit(world, 30.0, percentage=True)
-    world.hold(0.8, seconds=1.0)
-    assert sets(world, limits__linear_speed=0.7).success
-    world.hold(0.8, seconds=0.5)
-    limit(world, 0.0)
-    world.hold(0.8, seconds=1.0)
-    comparison = replayed(tape, world.config).comparison
-    assert comparison.first is None
-    assert comparison.exact
-    assert world.state.linear == pytest.approx(0.7, abs=0.02)

@@ -2,7 +2,7 @@
 
 The robot drives a square. The tests compare the pose of the daemon with a pose that is computed
 directly from the whole counts of the simulated encoders. Run the table with `pytest -m "slow or not
-slow" -s tests/scenarios/test_coarse_square.py`.
+slow" -s tests/scenarios/test_pose_square.py`.
 """
 
 from __future__ import annotations
@@ -14,7 +14,6 @@ import pytest
 
 from acsard.core.config.settings import Config, McuConfig, SimConfig
 from acsard.core.values import Pose
-from tests.each import more
 from tests.scenarios.world import World
 from tests.stepped import Outputs
 from tests.unit.core.motion.odometer import arc
@@ -82,19 +81,14 @@ class Square:
 
 
 @pytest.mark.variations(36)
-@pytest.mark.parametrize("seed", [1, more(2), more(3)])
-@pytest.mark.parametrize("stalls", [False, True], ids=["", "stalls"])
-@pytest.mark.parametrize(
-    "counts", [16, 3200, *(pytest.param(n, marks=pytest.mark.slow) for n in (20, 96, 400, 1000))]
-)
+@pytest.mark.parametrize("stalls", [True, False], ids=["stalls", ""])
+@pytest.mark.parametrize("counts", [16, 20, 96, 400, 1000, 3200])
 @pytest.mark.parametrize("link", ["plain", "checked", "checked with counts"])
-def test_a_square_ends_where_the_raw_counter_says(
-    link: str, counts: int, stalls: bool, seed: int
-) -> None:
-    square = Square(link, counts, stalls, seed)
+def test_a_square_ends_where_the_raw_counter_says(link: str, counts: int, stalls: bool) -> None:
+    square = Square(link, counts, stalls, 1)
     far, turned, raw_far, raw_turned = square.errors()
     print(
-        f"{link}, {counts} counts, {'stalls' if stalls else 'no stalls'}, seed {seed}: "
+        f"{link}, {counts} counts, {'stalls' if stalls else 'no stalls'}: "
         f"{1000 * far:.1f} mm {turned:.2f} deg; raw {1000 * raw_far:.1f} mm {raw_turned:.2f} deg"
     )
     assert "line_implausible" not in square.world.state.counters

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import random
 from contextlib import ExitStack
-from typing import Literal
 
 import pytest
 
@@ -245,19 +244,6 @@ def test_a_big_robot_that_responds_late_and_falls_short_is_a_warning(
             assert ("wheel" in row(made).message and row(made).level == 1) is (reaches < 1.0)
 
 
-@pytest.mark.slow
-def test_a_push_by_hand_with_a_stuck_encoder_is_reported_as_slip_of_one_side() -> None:
-    made = world()
-    made.drive(0.3, seconds=0.5)
-    made.send(0.0)
-    made.run(2.0)
-    with made.mcu.stuck_encoder(3), made.mcu.pushed(0.4):
-        made.run(2.0)
-        assert made.state.wheel_fault == "right wheels slip: front and rear turn differently"
-    made.run(2.0)
-    assert not made.state.wheel_fault
-
-
 def test_a_wheel_that_is_ignored_as_dead_leaves_the_turn_rate_uncertain() -> None:
     """The wheel may be blocked instead, and then the robot turns, but its odometry does not."""
     made = world()
@@ -314,26 +300,6 @@ def test_a_healthy_encoder_with_few_counts_does_not_look_like_one_that_fails(
     assert math.sqrt(pose[35]) < 0.5
 
 
-def test_stalls_of_the_computer_do_not_make_an_encoder_with_few_counts_look_failing() -> None:
-    """A line that covers a stall has a mean speed, which is not that of a single count."""
-    made = World(Config(sim=SimConfig(encoder_counts=20, motor_time_constant=0.1)))
-    made.run(1.5)
-    made.drive(0.15, seconds=1.0)
-    for _ in range(30):
-        made.hold(0.15, seconds=0.8)
-        made.stall(0.06)
-    assert math.sqrt(made.odom.pose.covariance[0]) < 0.1
-
-
-def test_wheels_of_both_sides_that_may_be_right_do_not_cancel() -> None:
-    made = World(Config(odometry=SURE))
-    made.run(1.5)
-    made.drive(0.5, seconds=1.0)
-    with made.mcu.stuck_encoder(0), made.mcu.bias(1, 0.0):
-        made.hold(0.5, seconds=1.0)
-    assert math.sqrt(made.odom.pose.covariance[35]) > 0.5
-
-
 def test_slip_makes_the_covariance_a_hundred_times_as_large() -> None:
     made = world()
     made.drive(0.5, seconds=1.5)
@@ -371,84 +337,3 @@ def test_ordinary_drives_cause_no_wheel_fault(counts: int, seconds: int) -> None
             with made.mcu.pushed(dice.uniform(-0.5, 0.5)):
                 made.run(1.0)
     assert not [event for event in made.events if event.name == "wheel_fault"]
-
-
-# faulty gyros
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("share", "does"),
-    [
-        (-1.0, "reversed"),
-        pytest.param(math.degrees(1.0), "in degrees", marks=SLOW),
-        pytest.param(0.0, "dead", marks=SLOW),
-    ],
-)
-def test_a_false_gyro_is_reported_in_the_first_turn_and_never_used(share: float, does: str) -> None:
-    made = world(ImperfectGyro(bias=0.001, noise=0.002, share=share))
-    made.run(1.5)
-    made.drive(0.2, 0.6, seconds=1.5)
-    assert made.state.gyro == does
-    for angular in (-1.0, 0.5):
-        made.hold(0.3, angular, seconds=0.7)
-        assert made.state.gyro == does
-    made.hold(0.0, seconds=1.0)
-    assert off(made)[1] < 0.02
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(("baud", "period"), [(38400, 0.01), (19200, 0.02)])
-def test_lines_that_waited_while_the_computer_stalled_cause_no_fault(
-    baud: Literal[19200, 38400], period: float
-) -> None:
-    """The board is free-running, and its watchdog stops the motors during the stall of the daemon.
-
-    The daemon then reads old lines in which the robot still moves.
-    """
-    world = World(Config(mcu=McuConfig(baud_rate=baud, reply_period=period)))
-    with world.mcu.free_running(period):
-        world.run(2.0)
-        world.drive(0.6, seconds=2.5)
-        world.stall(1.5)
-        world.run(0.02)
-    assert world.state.mode == "ready"
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("clear", [True, False])
-@pytest.mark.parametrize(("counts", "speed"), [(16, 1.0), (48, 0.5), (3200, 0.8)])
-def test_a_runaway_is_detected_after_a_late_step_and_again_after_a_clear(
-    counts: int, speed: float, clear: bool
-) -> None:
-    """A coarse encoder reports no motion in many single lines, although the wheel turns.
-
-    The daemon latches the fault nevertheless.
-    """
-    mcu = McuConfig(encoder_counts=counts, reply_period=0.01)
-    world = World(Config(mcu=mcu, sim=SimConfig(encoder_counts=counts)))
-    with world.mcu.free_running(0.01):
-        world.run(0.5)
-        world.drive(speed, seconds=0.8)
-        with world.mcu.pushed(speed):
-            world.stall(0.3)
-            world.hold(0.0, 0.0, 2.5)
-            assert world.state.mode == "fault"
-            if clear:
-                assert world.call("clear").success
-                world.hold(0.0, 0.0, 2.5)
-                assert world.state.mode == "fault"
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("every", [0.5, 0.7])
-def test_a_computer_that_is_late_repeatedly_hides_no_runaway(every: float) -> None:
-    world = World(Config(mcu=McuConfig(reply_period=0.01)))
-    with world.mcu.free_running(0.01):
-        world.run(0.5)
-        world.drive(0.8, seconds=1.0)
-        with world.mcu.pushed(0.8):
-            for _ in range(4):
-                world.stall(0.3)
-                world.hold(0.0, 0.0, every)
-    assert world.state.mode == "fault"

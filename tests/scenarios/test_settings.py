@@ -15,7 +15,6 @@ from acsard.core.incoming.queries import Query
 from acsard.core.messages.cdr import Cdr
 from acsard.core.messages.schema import ServiceReply
 from acsard.core.messages.signature import public_name
-from acsard.core.motion.limits import Motion
 from acsard.core.ros import parameters as rcl
 from acsard.core.values import NS_PER_S, Instant, Plain
 from acsard.daemon.control_loop import Step
@@ -70,21 +69,6 @@ def test_state_names_the_settings_that_were_changed_since_the_start(world: World
         assert world.state.settings_differ == text
 
 
-def test_changed_settings_are_named_in_the_order_of_the_file(world: World) -> None:
-    for key, value in (
-        ("rates__telemetry", 7.5),
-        ("rates__odom", 50.0),
-        ("commands__sources__app__timeout", 0.4),
-        ("limits__linear_speed", 0.4),
-    ):
-        assert sets(world, **{key: value}).success
-    world.run(0.2)
-    assert world.state.settings_differ == (
-        "limits.linear_speed = 0.4, not 1.0, commands.sources.app.timeout = 0.4, not 0.25, "
-        "rates.odom = 50.0, not 0.0, and 1 more"
-    )
-
-
 def test_a_lowered_limit_is_reached_by_the_deceleration_and_never_by_a_jump(world: World) -> None:
     world.drive(1.0, seconds=2.0)
     speeds = applied(world)
@@ -107,14 +91,6 @@ def test_a_raised_limit_is_reached_by_the_acceleration() -> None:
     assert speeds[-1][1] == pytest.approx(1.0)
 
 
-def test_a_speed_limit_of_zero_brings_the_robot_to_rest(world: World) -> None:
-    world.drive(0.5, seconds=1.0)
-    assert sets(world, limits__linear_speed=0.0).success
-    world.hold(0.5, seconds=1.0)
-    assert world.state.linear == 0.0
-    assert world.state.mode == "driving"
-
-
 def test_a_setting_is_in_config_and_in_the_log_with_its_client_and_old_value(
     world: World,
 ) -> None:
@@ -129,24 +105,11 @@ def test_a_setting_is_in_config_and_in_the_log_with_its_client_and_old_value(
     assert (config(world).limits.linear_speed, config(world).rates.telemetry) == (0.8, 5.0)
 
 
-def test_each_of_several_settings_is_reported(world: World) -> None:
-    for speed in (0.9, 0.8, 0.7):
-        sets(world, limits__linear_speed=speed)
-    assert len([event for event in world.events if event.name == "set"]) == 3
-
-
 def test_a_refused_change_changes_nothing_and_says_why(world: World) -> None:
     reply = sets(world, limits__angular_speed=1.0, limits__linear_deceleration=0.15)
     assert not reply.success
     assert config(world) == Config()
     assert not [event for event in world.events if event.name == "set"]
-
-
-def test_an_empty_payload_is_answered_with_an_example_of_a_valid_one(world: World) -> None:
-    for payload in (b"", b"{}", b'{"settings": {"limits.linear_speed": null}}'):
-        reply = world.call("set", payload)
-        assert not reply.success
-        assert '{"settings": {"limits.linear_speed": 0.8}}' in reply.message
 
 
 @pytest.mark.slow
@@ -218,25 +181,6 @@ def test_a_rate_is_in_force_from_the_next_message_on(world: World) -> None:
     assert 19 <= len(messages) <= 21
 
 
-def test_a_rate_whose_period_is_no_number_is_refused(world: World) -> None:
-    reply = sets(world, rates__odom=1e-300)
-    assert not reply.success
-    assert "at least 0.1 Hz" in reply.message
-    world.run(0.5)
-    assert world.state.mode == "ready"
-
-
-def test_noise_set_higher_makes_the_pose_less_certain(world: World) -> None:
-    def grows() -> float:
-        before = world.odom.pose.covariance[0]
-        world.drive(0.5, seconds=1.0)
-        return world.odom.pose.covariance[0] - before
-
-    little = grows()
-    assert sets(world, odometry__distance_variance_per_metre=1e-2).success
-    assert grows() > 20 * little
-
-
 def test_setting_the_present_value_is_answered_with_nothing_changes(world: World) -> None:
     reply = sets(world, limits__linear_speed=1.0)
     assert (reply.success, reply.message) == (
@@ -267,24 +211,6 @@ def test_ros_parameters_change_the_same_settings(world: World, service: str, via
     assert (refused.successful, "from 0 to 10 m/s" in refused.reason) == (False, True)
     assert not ask("drive.wheel_radius", 0.07).successful
     assert config(world).limits.linear_speed == 0.7
-
-
-@pytest.mark.slow
-def test_a_robot_that_does_not_brake_is_stopped_by_the_guard_whatever_is_set_meanwhile(
-    world: World, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    world.drive(1.0, seconds=2.0)
-    monkeypatch.setattr(Motion, "coast", lambda motion, *_, **__: motion)
-    world.put("stop", b"")
-    began_ns = world.now_ns
-    while world.state.mode != "fault" and world.now_ns - began_ns < 10 * NS_PER_S:
-        assert sets(world, limits__linear_speed=0.9 + world.now_ns % 7 / 100).success
-        world.run(0.02)
-    assert world.state.code == "guard_too_long"
-    assert (world.now_ns - began_ns) / NS_PER_S < 0.7  # 0.34 s of ramp and 0.3 s
-    still_ns = world.now_ns
-    world.run(60.0)
-    assert not moved(world, still_ns)
 
 
 def calls_of_longest_step(world: World, service: str, payload: bytes) -> int:

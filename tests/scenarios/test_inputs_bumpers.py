@@ -8,14 +8,11 @@ import pytest
 
 from acsard.core.config.settings import (
     Config,
-    ControlConfig,
-    McuConfig,
     Place,
     SafetyConfig,
     SimConfig,
 )
-from tests.scenarios.taped import Tape, replayed
-from tests.scenarios.test_emergency_stop import MOST, Watch, out_of
+from tests.scenarios.test_inputs_estop import MOST, Watch, out_of
 from tests.scenarios.world import World
 from tests.stepped import Outputs
 
@@ -54,42 +51,6 @@ class Lines:
         """The time from the press to the first line after it, ns, and this line."""
         at_ns, line = self.world.port.sent[self._first]
         return at_ns - self.pressed_ns, line
-
-
-SLUGGISH = Config(
-    control=ControlConfig(rate=20.0),
-    mcu=McuConfig(reply_period=0.1),
-    safety=STOP.safety,
-    sim=SimConfig(motor_time_constant=0.319),
-)
-"""A board with its own clock and slow motors, for which a fault is proved by few lines."""
-
-
-def test_lines_from_before_a_press_that_are_read_late_are_no_evidence_against_wheels() -> None:
-    world = World(SLUGGISH)
-    with world.mcu.bumpers(), world.mcu.free_running(0.1):
-        world.run(0.5)
-        world.drive(0.3, 0.0, seconds=4.0)
-        # The host stands still. The motors keep the last speeds until the daemon writes the zeros.
-        with world.mcu.bumper_pressed(1, 0.2, 1.0):
-            world.stall(0.25)
-            world.run(1.0)
-    assert (world.state.mode, world.state.code) == ("stopped", "bumper")
-
-
-def test_wheels_turn_on_while_the_zeros_after_a_press_cannot_be_written() -> None:
-    world = World(SLUGGISH)
-    with world.mcu.bumpers(), world.mcu.free_running(0.1):
-        world.run(0.5)
-        world.drive(0.4, 0.0, seconds=4.07)
-        world.run(0.09)
-        with world.mcu.bumper_pressed(1, 0.0, 1.0):
-            world.port.blocked = True
-            world.run(0.2)
-            world.port.blocked = False
-            world.run(1.0)
-    assert world.loop.robot.counters["lines_superseded"] > 0
-    assert world.state.mode == "stopped"
 
 
 @pytest.mark.slow
@@ -162,21 +123,6 @@ def test_a_limiting_bumper_stops_the_robot_within_a_period_and_allows_only_retre
     assert (retreats > 0) == (sign != 0)
 
 
-@pytest.mark.slow
-def test_the_virtual_robot_moves_away_from_the_obstacle() -> None:
-    world = World(AWAY)
-    with world.mcu.bumpers():
-        world.drive(0.5, seconds=2.0)
-        with world.mcu.bumper_pressed(1, 0.0, 0.0):
-            world.hold(0.5, seconds=0.5)
-            x = world.state.x
-            world.hold(0.5, seconds=1.0)
-            assert world.state.x == pytest.approx(x, abs=0.001)
-            world.drive(-0.8, 0.5, seconds=2.0)
-            assert world.state.x == pytest.approx(x - 0.2, abs=0.03)
-            assert world.state.yaw == pytest.approx(0.0, abs=0.01)
-
-
 def test_a_board_that_falls_silent_about_its_bumpers_stops_the_robot() -> None:
     world = World(Config(safety=AWAY.safety, sim=SimConfig(faults=("bumpers_silent=2:3",))))
     world.run(0.2)
@@ -190,24 +136,6 @@ def test_a_board_that_falls_silent_about_its_bumpers_stops_the_robot() -> None:
     assert world.call("clear").success
 
 
-def test_the_simulator_presses_two_bumpers_and_a_driver_fails_as_configured() -> None:
-    faults = ("bumper_pressed=1:2:2", "bumper_pressed=3:3:2", "bumpers", "driver_fault=6:0")
-    world = World(Config(sim=SimConfig(faults=faults)))
-    marks = []
-    world.run(0.05)
-    for _ in range(11):
-        world.run(0.5)
-        assert world.state.bumpers is not None
-        marks.append("".join("X" if pressed else "." for pressed in world.state.bumpers))
-    assert marks == ["...."] * 3 + ["X..."] * 2 + ["X.X."] * 2 + ["..X."] * 2 + ["...."] * 2
-    assert world.state.mode == "stopped"
-    assert world.state.counters["bumper_presses"] == 2
-    world.run(1.0)
-    assert world.state.mode == "fault"
-    assert world.state.code == "driver_fault"
-    assert not world.call("clear").success
-
-
 def test_a_robot_with_places_waits_for_its_bumpers_and_then_becomes_ready() -> None:
     world = World(STOP)
     world.run(1.0)
@@ -216,27 +144,3 @@ def test_a_robot_with_places_waits_for_its_bumpers_and_then_becomes_ready() -> N
     with world.mcu.bumpers():
         world.run(0.2)
         assert world.state.mode == "ready"
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("config", [STOP, AWAY], ids=["stop", "away"])
-def test_a_recording_replays_presses_and_releases(config: Config) -> None:
-    config = Config(
-        safety=config.safety,
-        sim=SimConfig(faults=("bumper_pressed=1:2:1", "bumper_pressed=4:3.5:1", "bumpers")),
-    )
-    tape = Tape()
-    world = World(config, recorder=tape)
-    world.drive(0.5, seconds=2.5)
-    assert world.state.bumpers == [True, False, False, False]
-    middle, tape.cut = len(tape.taken) + 1, True
-    world.drive(-0.5, seconds=1.5)
-    while world.newest and not world.call("clear").success:
-        world.run(0.2)
-    world.drive(0.5, seconds=1.0)
-    names = {event.name for step in tape.taken for event in step.news.events}
-    assert {"bumper_pressed", "bumper_released"} <= names
-    for first in (0, middle):
-        comparison = replayed(tape, config, first).comparison
-        assert comparison.first is None
-        assert comparison.steps == len(tape.taken) - first

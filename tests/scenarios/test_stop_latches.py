@@ -5,22 +5,21 @@ The clients here read `state`, and each clear names the causes that the client r
 
 from __future__ import annotations
 
-import random
 from collections.abc import Sequence
 
 import msgspec
 import pytest
 
-from acsard.core.incoming.commands import Arrival, Via
+from acsard.core.incoming.commands import Via
 from acsard.core.incoming.queries import Query
 from acsard.core.messages.cdr import Cdr
-from acsard.core.messages.schema import RobotState, ServiceReply
+from acsard.core.messages.schema import ServiceReply
 from acsard.core.messages.signature import public_name
 from acsard.core.motion.latches import after_restart
 from acsard.core.ros.attachments import Attachment
 from acsard.core.ros.shapes import Trigger
 from acsard.core.values import NS_PER_S
-from tests.scenarios.speakers import Speaker, moved
+from tests.scenarios.speakers import moved
 from tests.scenarios.world import World, naming
 
 JOE = public_name("joe")
@@ -116,17 +115,6 @@ def test_a_plain_clear_works_on_a_computer_that_stalls_all_the_time(
     assert done == 40
 
 
-def test_a_stop_counts_as_shown_only_after_the_step_that_published_it(world: World) -> None:
-    world.bus.arrivals.append(Arrival("stop", True, b"", "", world.now_ns, None, ""))
-    world.stall_in_step(3.0)
-    # This clear arrived after 2.5 s, before the state had been published.
-    query = Query(1, "srv/clear", "srv/clear", "", b"", "", world.now_ns - NS_PER_S // 2)
-    world.bus.queries.append(query)
-    world.run(0.02)
-    reply = msgspec.json.decode(world.bus.replies[1][0].payload, type=ServiceReply)
-    assert (reply.success, world.state.mode) == (False, "stopped")
-
-
 def test_every_stop_has_a_number_of_its_own_and_one_caller_has_one_stop(world: World) -> None:
     latches = []
     for name in ("ann", "joe", "joe"):
@@ -137,16 +125,6 @@ def test_every_stop_has_a_number_of_its_own_and_one_caller_has_one_stop(world: W
     assert latches == sorted(set(latches))
     assert len(world.numbers) == 2
     assert msgspec.json.decode(msgspec.json.encode(float(latches[-1]))) == latches[-1]
-
-
-def test_a_renewed_stop_is_published_at_once() -> None:
-    world = World(wanted=("state",))
-    world.run(0.2)
-    for _ in range(3):
-        call(world, "stop", "joe")
-        state = world.bus.published["state"][-1]
-        assert isinstance(state, RobotState)
-        assert [cause.number for cause in state.causes] == world.numbers
 
 
 def test_the_state_shows_each_cause(world: World) -> None:
@@ -167,42 +145,6 @@ def test_the_state_shows_each_cause(world: World) -> None:
     assert second.age == pytest.approx(0.3, abs=0.25)
 
 
-def test_a_bumper_does_not_hide_the_client_that_stopped_the_robot(world: World) -> None:
-    with world.mcu.bumpers():
-        world.run(0.2)
-        call(world, "stop", "joe")
-        shown = world.numbers
-        with world.mcu.bumper_pressed(1, 0.0, 0.0):
-            world.run(0.2)
-        world.run(0.2)
-        assert "bumper 1 pressed (latched at 2027" in world.state.reason
-        assert f"; also stopped by {JOE} (native) at 2027" in world.state.reason
-        assert call(world, "clear", "ann", shown).success
-        assert (world.state.mode, world.state.code) == ("stopped", "bumper")
-        assert call(world, "clear", "ann", world.numbers).success
-        assert world.state.mode == "ready"
-
-
-def test_the_answer_to_a_stop_has_the_number_of_the_stop_of_its_client(world: World) -> None:
-    (first,) = world.call("stop").data.numbers
-    assert first == world.newest
-    assert call(world, "stop", "joe").data.numbers == [world.newest] != [first]
-    (again,) = world.call("stop").data.numbers
-    assert again == world.newest > first
-
-
-def test_a_stop_that_arrives_ahead_of_its_query_is_one_cause(world: World) -> None:
-    world.put("stop", b"", attachment=msgspec.json.encode({"sender": "joe"}))
-    arrived_ns, ahead = world.now_ns, world.newest
-    world.run(0.3)
-    key = "srv/stop"
-    attachment = msgspec.json.encode({"sender": "joe"})
-    world.bus.queries.append(Query(1, key, key, "", b"", "", arrived_ns, "native", attachment))
-    world.run(0.02)
-    assert world.bus.replies[1]
-    assert world.newest == ahead > 0
-
-
 def test_a_flood_of_stops_hides_neither_the_first_client_nor_the_last(world: World) -> None:
     for name in range(60):
         call(world, "stop", f"client{name}")
@@ -216,63 +158,7 @@ def test_a_flood_of_stops_hides_neither_the_first_client_nor_the_last(world: Wor
     assert [cause.by for cause in world.state.causes] == [f"{JOE} (native)"]
 
 
-@pytest.mark.slow
-@pytest.mark.variations(50)
-@pytest.mark.parametrize("seed", range(100))
-def test_no_delayed_clear_releases_a_stop_that_its_sender_had_not_seen(seed: int) -> None:
-    """Three operators stop and clear the robot over networks that delay messages by up to 5 s."""
-    dice, world = random.Random(seed), World()
-    world.run(0.2)
-    moving = Speaker(world, "signed")
-    stops: list[tuple[int, int]] = []
-    """When each stop was obeyed, and its number."""
-    states: list[tuple[int, list[int]]] = [(world.now_ns, [])]
-    """When each state was published, and its numbers."""
-    pending: list[tuple[int, int]] = []
-    """When each clear is delivered, and the state that its sender had read then."""
-    for _ in range(150):
-        moving.send(dice.choice((0.0, 0.5)))
-        world.run(dice.uniform(0.02, 0.2))
-        states.append((world.now_ns, world.numbers))
-        roll = dice.random()
-        if roll < 0.1:
-            assert call(world, "stop", dice.choice(("ann", "joe"))).success
-            stops.append((world.now_ns, world.newest))
-        elif roll < 0.4:
-            read = max(0, len(states) - 1 - dice.randrange(20))
-            pending.append((world.now_ns + dice.randrange(5 * NS_PER_S), read))
-        for clear in [request for request in pending if request[0] <= world.now_ns]:
-            pending.remove(clear)
-            read_ns, numbers = states[clear[1]]
-            before = set(world.numbers)
-            call(world, "clear", "eve", numbers)
-            assert before - set(world.numbers) == before & set(numbers)
-            assert all(at <= read_ns for at, number in stops if number in numbers)
-            later = [number for at, number in stops if at > read_ns]
-            assert before & set(later) <= set(world.numbers)
-            assert (world.state.mode == "stopped") is bool(world.numbers)
-    assert len(stops) > 3
-    if world.numbers:
-        assert call(world, "clear", "eve", world.numbers).success
-    assert world.state.mode in ("ready", "driving")
-
-
 # an activate and a later deactivate
-
-
-def test_an_activate_read_before_a_later_deactivate_and_delivered_after_it_is_refused(
-    world: World,
-) -> None:
-    call(world, "deactivate", "ann")
-    shown = world.numbers
-    world.run(3.0)
-    assert call(world, "activate", "ann", shown).success
-    call(world, "deactivate", "joe")
-    world.run(3.0)
-    reply = call(world, "activate", "eve", shown)
-    assert (reply.success, world.state.mode) == (False, "inactive")
-    assert call(world, "activate", "ann", world.numbers).success
-    assert world.state.mode == "ready"
 
 
 @pytest.mark.parametrize("via", ["native", "rmw", "bridge"])
@@ -306,25 +192,6 @@ def test_a_plain_clear_releases_the_fault_and_then_the_stop(world: World) -> Non
     assert world.state.mode == "stopped"
     assert call(world, "clear", "ann", via="rmw").success
     assert world.state.mode == "ready"
-
-
-def test_a_clear_of_one_fault_does_not_release_another_fault_that_came_after_it(
-    world: World,
-) -> None:
-    """The second fault's cause ends by itself, so a wrongly released fault would be lost."""
-    with world.mcu.reversed_motor(0):
-        world.drive(0.5, seconds=2.0)
-    assert world.state.mode == "fault"
-    shown = world.numbers
-    with world.mcu.driver_fault(0.0, 0.3):
-        world.run(0.25)
-        assert world.newest > max(shown)
-        world.run(1.0)  # until the board reports that the driver's fault is over
-    assert world.state.code == "driver_fault"
-    assert call(world, "clear", "ann", shown).success
-    assert (world.state.mode, world.state.code) == ("fault", "driver_fault")
-    assert call(world, "clear", "ann", world.numbers).success
-    assert world.state.mode != "fault"
 
 
 # a restart

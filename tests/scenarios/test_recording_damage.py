@@ -97,17 +97,6 @@ def test_damage_costs_one_frame(seed: int, long: Path, whole: list[int], tmp_pat
     judge(path, whole)
 
 
-@pytest.mark.soak
-def test_damage_at_any_place_costs_one_frame(long: Path, whole: list[int], tmp_path: Path) -> None:
-    dice, path = random.Random(5), tmp_path / "damaged"
-    for _ in range(100):
-        data = bytearray(long.read_bytes())
-        at = dice.randrange(len(data) - 16)
-        data[at : at + 16] = dice.randbytes(16)
-        path.write_bytes(data)
-        judge(path, whole)
-
-
 def test_a_damaged_beginning_costs_the_first_frame(
     long: Path, whole: list[int], tmp_path: Path
 ) -> None:

@@ -1,0 +1,328 @@
+"""The checked link with the whole daemon: new and old firmware, noise, losses, resets, counts."""
+
+from __future__ import annotations
+
+import math
+import random
+
+import pytest
+from msgspec import json
+from msgspec.structs import replace
+
+from acsard.core.config.settings import (
+    Config,
+    McuConfig,
+    SimConfig,
+)
+from acsard.core.messages.schema import DiagnosticArray
+from acsard.core.simulator import protocol
+from acsard.core.simulator.fake_mcu import FakeMcu
+from acsard.core.values import NS_PER_S, Instant, Received
+from tests.scenarios.world import VirtualPort, World
+
+MS = 1_000_000
+ZERO = b"ap00.00,bp00.00,cp00.00,dp00.00"
+
+
+def config(check: str = "on", counts: int = 0, **mcu: object) -> Config:
+    return Config(mcu=McuConfig(link_check=check, encoder_counts=counts, **mcu))  # type: ignore[arg-type]
+
+
+def started(made: Config) -> World:
+    world = World(made)
+    world.run(0.3)
+    return world
+
+
+def moving(lines: list[bytes]) -> list[bytes]:
+    return [line for line in lines if line.strip() and not line.startswith((ZERO, b"?"))]
+
+
+def check_of(world: World) -> str:
+    """Return the current check of the link, as the diagnostics report it."""
+    message = world.loop.publication.current("diagnostics")
+    assert isinstance(message, DiagnosticArray)
+    (link,) = [status for status in message.status if status.name == "acsard: serial link"]
+    return {pair.key: pair.value for pair in link.values}["check"]
+
+
+def stopped(world: World) -> bool:
+    return world.mcu.vehicle.set_points == [0.0] * 4
+
+
+def texts(world: World, name: str) -> list[str]:
+    return [event.text for event in world.events if event.name == name]
+
+
+def off_by(world: World) -> float:
+    """Return the distance between pose and simulated robot, as a share of the path length."""
+    at, true = world.state, world.mcu.vehicle.pose
+    return math.hypot(at.x - true.x, at.y - true.y) / math.hypot(true.x, true.y)
+
+
+# the firmware at the other end
+
+
+def test_a_new_mcu_is_driven_with_checked_lines() -> None:
+    world = started(config())
+    world.drive(0.5, seconds=2.0)
+    assert world.state.mode == "driving"
+    assert check_of(world) == "checked"
+    assert texts(world, "link_check") == []
+    lines = moving(world.lines())
+    assert len(lines) > 150
+    assert all(protocol.reference(line) and b"#" in line for line in lines)
+    world.run(1.5)
+    assert stopped(world)
+    assert world.state.x == pytest.approx(world.mcu.vehicle.pose.x, abs=0.005)
+    assert set(world.state.counters) <= {"lines", "lines_sent", "commands"}
+
+
+def test_a_new_mcu_is_driven_with_samples_when_counts_are_configured() -> None:
+    world = started(config(counts=3200))
+    world.drive(0.5, seconds=1.0)
+    assert check_of(world) == "checked with samples"
+    assert all(b"S*" in line for line in moving(world.lines()))
+
+
+def test_an_mcu_without_samples_is_driven_checked_and_the_log_says_what_is_missing() -> None:
+    world = World(config(counts=3200))
+    with world.mcu.no_sample():
+        world.run(0.3)
+        world.drive(0.5, seconds=1.0)
+        assert check_of(world) == "checked"
+        (text,) = texts(world, "link_check")
+        assert "does not send encoder counts" in text
+    assert world.state.mode == "driving"
+
+
+OLD_FIRMWARE = pytest.mark.parametrize(
+    ("firmware", "comma"), [("no_check", False), ("plain_only", False), ("comma_latched", True)]
+)
+
+
+@pytest.mark.parametrize("boots", [False, True])
+@OLD_FIRMWARE
+def test_old_firmware_is_never_driven_on_a_checked_link_and_the_reason_names_the_setting(
+    firmware: str, comma: bool, boots: bool
+) -> None:
+    world = World(config("on", trailing_comma=comma))
+    with getattr(world.mcu, firmware)():
+        if boots:
+            world.mcu.reset(world.now_ns)
+        world.drive(0.5, seconds=9.0)
+        assert not moving(world.lines())
+        assert (world.state.mode, world.state.link) == ("waiting", "booting")
+        silent = boots and firmware == "plain_only"  # all that it has heard is checked
+        assert world.state.code == ("received_nothing" if silent else "no_checksum")
+        assert "mcu.link_check" in world.state.reason
+        assert len(texts(world, "link_check")) == (not silent)
+    world.run(0.5)  # a person has installed new firmware
+    world.drive(0.5, seconds=1.0)
+    assert world.state.mode == "driving"
+
+
+# resets
+
+
+def test_a_reset_is_found_by_the_clock_when_its_announcement_is_lost() -> None:
+    world = started(config("on", 3200))
+    world.drive(0.5, seconds=1.0)
+    x = world.state.x
+    world.mcu.reset(world.now_ns, 30 * MS)
+    world.mcu._events.clear()  # neither noise nor identity gets through
+    world.hold(0.5, seconds=2.0)
+    assert any("its clock went back" in text for text in texts(world, "mcu_restarted"))
+    assert world.state.mode == "ready"
+    assert stopped(world)
+    assert world.state.x - x < 0.05
+
+
+def test_another_mcu_on_the_port_without_the_check_does_not_move() -> None:
+    world = started(config(counts=3200))
+    world.drive(0.5, seconds=1.0)
+    x = world.state.x
+    world.port.unplug()
+    world.run(0.5)
+    world.mcu = FakeMcu(world.config, world.now_ns)
+    world.port.plug(world.mcu)
+    with world.mcu.no_check():
+        world.hold(0.5, seconds=1.0)
+        assert not moving(world.lines())
+        assert world.state.code == "no_checksum"
+    assert world.state.x == pytest.approx(x, abs=0.02)
+
+
+# damage
+
+
+def test_a_burst_of_damaged_replies_stops_and_goes_on() -> None:
+    world = started(config("on", 3200))
+    world.drive(0.5, seconds=1.0)
+    sent = len(world.port.sent)
+    with world.mcu.noise(b"~"):
+        world.hold(0.5, seconds=0.08, hz=100.0)
+        assert world.state.link == "stale"
+        assert world.state.code == "replies_damaged"
+        world.hold(0.5, seconds=0.3)
+        late = [line for _, line in list(world.port.sent)[sent + 8 :]]
+        assert late
+        assert not moving(late)
+    world.hold(0.5, seconds=1.0)
+    assert world.state.mode == "driving"  # a short gap only ramps up again from rest
+    assert check_of(world) == "checked with samples"
+    assert world.state.counters["line_crc_error"] >= 5
+    world.send(0.0)
+    world.run(1.0)
+    assert off_by(world) < 0.001
+
+
+@pytest.mark.slow
+def test_noise_never_talks_an_mcu_out_of_the_check() -> None:
+    world = started(config())
+    world.drive(0.5, seconds=1.0)
+    for _ in range(5):
+        with world.mcu.no_check():
+            world.hold(0.5, seconds=2.0)
+            assert stopped(world)
+            assert world.state.code == "no_checksum"
+        world.run(0.3)
+        assert check_of(world) == "checked"
+
+
+@pytest.mark.variations(3)
+@pytest.mark.parametrize("every", [2, 3, 7])
+def test_bit_errors_both_ways_change_no_speed(every: int) -> None:
+    world = started(config("on", 3200))
+    world.drive(0.4, seconds=0.5)
+    set_points: set[float] = set()
+    with world.mcu.bit_errors(every):
+        for _ in range(200):
+            world.hold(0.4, seconds=0.01, hz=100.0)
+            set_points.update(world.mcu.vehicle.set_points)
+            assert all(abs(speed) < 8.5 for speed in world.state.wheels)
+    assert max(set_points) <= 8.0
+    assert min(set_points) >= 0.0
+
+
+# counts
+
+
+def lossy_drive(check: str, counts: int) -> World:
+    """Drive along curves while 20 % of the lines are lost in each direction. Return the world."""
+    world = started(config(check, counts))
+    with world.mcu.lost_replies(every=5), world.mcu.lost_commands(every=5):
+        for turn in (0.0, 0.6, -0.6, 0.3, 0.0):
+            world.drive(0.5, turn, seconds=4.0)
+        world.send(0.0)
+        world.run(1.5)
+    assert "fault" not in {event.name for event in world.events}
+    assert world.mcu.vehicle.pose.x > 5.0
+    return world
+
+
+@pytest.mark.slow
+def test_with_counts_lost_lines_lose_no_distance() -> None:
+    by_speeds, by_counts = off_by(lossy_drive("off", 0)), off_by(lossy_drive("on", 3200))
+    print(f"\n  20 % lost: {by_speeds:.4%} off by speeds, {by_counts:.4%} by counts")
+    assert by_counts < 0.001
+
+
+class LatePort(VirtualPort):
+    """A port whose bytes the daemon reads in batches and up to 60 ms late, as on a busy host."""
+
+    world: World
+    dice = random.Random(5)
+    ready_ns = 0
+    held: list[bytes]
+
+    def feed(self, received: Received) -> None:
+        self.held.append(received.data)
+
+    def take(self, late: Instant | None = None) -> tuple[Received, ...]:
+        now = self.world.instant
+        if now.mono_ns < self.ready_ns or not self.held:
+            return ()
+        chunk = Received(now, b"".join(self.held))
+        self.held.clear()
+        self.ready_ns = now.mono_ns + self.dice.choice((0, 3, 20, 60)) * MS
+        return (chunk,)
+
+
+def jittery_drive(check: str, counts: int) -> World:
+    world = World(config(check, counts))
+    port = LatePort(*world.port._opening)
+    port.world, port.held = world, []
+    port.plug(world.mcu)
+    world.port = world.loop._port = port
+    world.run(0.5)
+    for turn in (0.8, -0.8, 1.5, -1.5, 0.4):
+        world.drive(0.5, turn, seconds=3.0)
+    world.send(0.0)
+    world.run(1.5)
+    assert "fault" not in {event.name for event in world.events}
+    return world
+
+
+@pytest.mark.slow
+def test_with_counts_late_reads_of_the_host_do_not_bend_the_pose() -> None:
+    by_speeds, by_counts = off_by(jittery_drive("off", 0)), off_by(jittery_drive("on", 3200))
+    print(f"\n  late reads: {by_speeds:.4%} off by speeds, {by_counts:.4%} by counts")
+    assert by_counts < min(0.001, by_speeds)
+
+
+@pytest.mark.slow
+def test_counts_and_clock_wrap_in_a_long_drive_without_a_jump_of_the_pose() -> None:
+    fine = replace(config("on", 40_000), sim=SimConfig(encoder_counts=40_000))
+    world = World(fine)
+    world.mcu._on_ns -= 60 * NS_PER_S  # run for a minute: the clock wraps in 5 s
+    world.run(0.3)
+    last = (0.0, 0.0)
+    for _ in range(15):
+        world.drive(0.9, 0.9, seconds=1.0)
+        here = (world.state.x, world.state.y)
+        assert math.dist(here, last) < 1.3
+        last = here
+    world.send(0.0)
+    world.run(1.5)
+    true, state = world.mcu.vehicle.pose, world.state
+    assert world.mcu._counted[0] > 20 * 65536
+    assert math.dist((state.x, state.y), (true.x, true.y)) < 0.001
+    assert math.remainder(state.yaw - true.yaw, math.tau) == pytest.approx(0.0, abs=0.001)
+    assert world.state.counters.get("line_count_leap", 0) == 0
+
+
+@pytest.mark.slow
+def test_a_stall_of_the_host_loses_no_distance_with_counts() -> None:
+    world = started(config("on", 3200))
+    world.drive(0.5, seconds=1.0)
+    world.send(0.5)
+    world.stall(0.2)
+    world.hold(0.5, seconds=0.5)
+    world.send(0.0)
+    world.run(1.5)
+    assert off_by(world) < 0.001
+
+
+# anything
+
+
+@pytest.mark.parametrize(("before", "after"), [(0.02, 0.3), (0.1, 0.2), (0.2, 0.2), (0.25, 0.1)])
+def test_a_pose_that_is_set_in_a_silence_of_the_board_is_in_its_covariance(
+    before: float, after: float
+) -> None:
+    """The counts that end the silence also have the motion from before the pose was set."""
+    world = started(config(counts=3200))
+    world.drive(0.8, 0.3, seconds=2.0)
+    with world.mcu.mute():
+        world.hold(0.8, 0.3, seconds=before)
+        true = world.mcu.vehicle.pose
+        assert world.call("set_pose", json.encode(true)).success
+        world.run(after)
+    world.run(1.0)
+    pose, p = world.mcu.vehicle.pose, world.odom.pose.covariance
+    for off, variance in (
+        (pose.x - world.state.x, p[0]), (pose.y - world.state.y, p[7]),
+        (math.remainder(pose.yaw - world.state.yaw, math.tau), p[35]),
+    ):  # fmt: skip
+        assert abs(off) < 2.0 * math.sqrt(variance)

@@ -1,0 +1,128 @@
+"""Clients send commands, wait or are refused, and `state` always gives the reason."""
+
+from __future__ import annotations
+
+import msgspec
+import pytest
+
+from tests.each import each
+from tests.scenarios.speakers import Speaker
+from tests.scenarios.world import World
+
+
+@pytest.fixture
+def world() -> World:
+    world = World()
+    world.run(0.2)
+    return world
+
+
+@pytest.mark.slow
+@each(
+    ("key", "payload", "put", "reason"),
+    [
+        ("cmd/app", b"{", True, "malformed"),
+        ("cmd/app", b"hello", True, "unknown_encoding"),
+        ("cmd/app", b"", True, "unknown_encoding"),
+        ("cmd/app", b'{"linear":{"x":0.5}}', True, "wrong_shape"),
+        ("cmd/app", b'{"linear":{"x":"fast"},"angular":{}}', True, "wrong_shape"),
+        ("cmd/app", b'{"linear":{"speed":1},"angular":{}}', True, "wrong_shape"),
+        ("cmd/app", b'{"linear":{},"angular":{}}' + b" " * 5000, True, "too_big"),
+        ("cmd/app", b'{"linear":{"x":0.5},"angular":{}}', False, "not_a_put"),
+        ("cmd/*", b'{"linear":{"x":0.5},"angular":{}}', True, "wildcard"),
+        ("**", b'{"linear":{"x":0.5},"angular":{}}', True, "wildcard"),
+        ("cmd/stranger", b'{"linear":{"x":0.5},"angular":{}}', True, "unknown_source"),
+        ("wheel_cmd/app", b'{"name":["a"],"velocity":[1]}', True, "wrong_wheels"),
+        (
+            "cmd/app",
+            msgspec.msgpack.encode({"linear": {"x": float("nan")}, "angular": {}}),
+            True,
+            "not_finite",
+        ),
+        (
+            "cmd/app",
+            msgspec.msgpack.encode({"linear": {"y": float("inf")}, "angular": {}}),
+            True,
+            "not_finite",
+        ),
+    ],
+)
+def test_a_bad_command_is_refused_as_a_whole_and_counted(
+    key: str, payload: bytes, put: bool, reason: str
+) -> None:
+    world = World()
+    world.run(0.2)
+    world.drive(0.3, seconds=0.5)
+    world.run(0.2)
+    world.put(key, payload, put)
+    world.run(0.06)
+    assert world.state.counters[f"command_{reason}"] == 1
+    assert world.state.refused
+    assert world.state.mode == "ready"  # it extended nothing: the timeout has passed
+
+
+def test_stamps_that_zenoh_replaces_are_only_counted(world: World) -> None:
+    client = Speaker(world, "signed", ahead=0.4)
+    client.open()
+    assert "stamps_replaced" not in world.state.counters
+    ahead = Speaker(world, "signed", "b", ahead=3600.0)
+    world.run(0.5)
+    ahead.open()
+    assert world.state.counters["stamps_replaced"] == 40
+
+
+def test_set_pose_and_reset_odometry_move_the_pose_and_not_the_robot(world: World) -> None:
+    reply = world.call("set_pose", msgspec.json.encode({"x": 1.0, "y": -2.0, "yaw": 4.0}))
+    assert reply.success
+    state = world.state
+    assert (state.x, state.y) == (1.0, -2.0)
+    assert state.yaw == pytest.approx(4.0 - 2 * 3.141592653589793)
+    assert world.call("reset_odometry").success
+    assert (world.state.x, world.state.y, world.state.yaw) == (0.0, 0.0, 0.0)
+    assert not world.call("set_pose", b'{"x": 1}').success
+
+
+def test_a_query_on_the_wildcard_calls_no_service(world: World) -> None:
+    for service in ("stop", "clear", "deactivate"):
+        assert world.ask(f"srv/{service}", asked="**") == []
+    assert world.state.mode == "ready"
+
+
+def test_state_is_published_ten_times_a_second_and_immediately_on_change(world: World) -> None:
+    world.bus.wanted_keys.add("state")
+    world.run(0.5)
+    published = world.bus.published["state"]
+    before = len(published)
+    world.run(5.0)
+    assert len(published) - before == 50
+    before = len(published)
+    world.put("stop", b"")
+    world.run(0.012)
+    assert len(published) - before >= 1
+
+
+def test_commands_that_a_newer_one_follows_before_the_step_are_counted(world: World) -> None:
+    """The newest command of each source is not counted as superseded."""
+    world.send_together([0.1, 0.2, 0.3])
+    world.send_together([0.4], source="teleop")
+    world.run(0.1)
+    assert world.state.counters["commands_superseded"] == 2
+    world.send(0.1)
+    world.run(0.1)
+    assert world.state.counters["commands_superseded"] == 2
+
+
+def test_after_a_stall_a_waiting_command_without_a_stamp_does_not_drive(world: World) -> None:
+    """Its sender may have ended during the stall. A sender that still runs drives again."""
+    world.drive(0.5, seconds=1.0)
+    world.stall(0.9)
+    before = world.mcu.vehicle.pose.x
+    world.send(0.5)
+    world.run(0.5)
+    assert world.mcu.vehicle.pose.x == pytest.approx(before, abs=0.01)
+    assert world.state.mode == "ready"
+    world.hold(0.5, seconds=0.5)
+    assert world.state.mode == "driving"
+
+
+# several people on one source, and networks that delay samples

@@ -1,0 +1,75 @@
+"""Clients send commands, wait or are refused, and `state` always gives the reason."""
+
+from __future__ import annotations
+
+import pytest
+
+from tests.scenarios.world import World
+
+
+@pytest.fixture
+def world() -> World:
+    world = World()
+    world.run(0.2)
+    return world
+
+
+def test_a_stop_latches_until_clear_and_then_requires_neutral(world: World) -> None:
+    world.drive(0.5, seconds=1.0)
+    assert world.call("stop").success
+    world.hold(0.5, seconds=1.0)
+    assert (world.state.mode, world.state.code) == ("stopped", "stopped")
+    assert world.state.linear == 0.0
+    assert world.call("clear").success
+    world.hold(0.5, seconds=1.0)
+    assert world.state.mode == "ready"
+    world.drive(0.5, seconds=0.5)
+    assert world.state.mode == "driving"
+
+
+def test_a_stop_brakes_harder_than_a_timeout(world: World) -> None:
+    world.drive(0.9, seconds=2.0)
+    world.put("stop", b"")
+    world.run(0.4)
+    assert world.lines()[-1] == b"ap00.00,bp00.00,cp00.00,dp00.00\r\n"
+
+
+def test_a_put_on_stop_stops_the_robot_with_any_payload(world: World) -> None:
+    for payload in (b"", b"\x00", b"{}", b"please"):
+        world.put("stop", payload)
+        world.run(0.02)
+        assert world.state.mode == "stopped"
+        world.call("clear")
+
+
+def test_a_delete_on_stop_is_not_a_stop(world: World) -> None:
+    world.put("stop", b"", put=False)
+    world.run(0.02)
+    assert world.state.mode == "ready"
+
+
+def test_a_deactivated_robot_ramps_down_and_ignores_commands(world: World) -> None:
+    world.drive(0.5, seconds=1.0)
+    assert world.call("deactivate").success
+    world.hold(0.5, seconds=1.0)
+    assert world.state.mode == "inactive"
+    assert world.state.linear == 0.0
+
+
+def test_a_robot_stopped_while_inactive_is_inactive_after_clear(world: World) -> None:
+    world.call("deactivate")
+    world.call("stop")
+    world.call("clear")
+    assert world.state.mode == "inactive"
+
+
+def test_shutting_down_ramps_to_rest_and_obeys_no_client(world: World) -> None:
+    world.drive(0.9, seconds=2.0)
+    world.loop.shutting_down = True
+    world.hold(0.9, seconds=0.35)
+    assert world.loop.at_rest
+    assert world.state.mode == "shutdown"
+    assert not world.call("activate").success
+
+
+# several people on one source, and networks that delay samples

@@ -1,0 +1,239 @@
+"""A sender is armed by a zero of its own, never by the zero of another.
+
+`python -m tests.scenarios.test_who_drives 1000` plays so many starts and returns of two senders.
+"""
+
+from __future__ import annotations
+
+import random
+import sys
+from typing import get_args
+
+import pytest
+
+from acsard.core.values import NS_PER_S
+from tests.each import each
+from tests.scenarios.speakers import SHARED, Speaker, Way, moved
+from tests.scenarios.world import World
+
+OWN: tuple[Way, ...] = ("client", "signed", "rmw")
+
+
+def quiet() -> World:
+    world = World()
+    world.run(0.3)
+    return world
+
+
+def cleared(way: Way, *names: str) -> tuple[World, list[Speaker]]:
+    """Return a world after `stop` and `clear`, and senders whose delays the daemon has proved."""
+    world = quiet()
+    speakers = [Speaker(world, way, name) for name in names]
+    for speaker in speakers:
+        speaker.open()
+        world.run(1.2)
+    world.call("stop")
+    world.run(2.1)
+    assert world.call("clear").success
+    world.run(0.1)
+    return world, speakers
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("way", get_args(Way))
+def test_the_zeros_of_one_program_never_arm_another(way: Way) -> None:
+    """One client sends only zeros and another one only speeds, and the robot stays at rest.
+
+    Before this rule the robot moved 2.1 m in 5 s.
+    """
+    for seed in range(2):
+        dice = random.Random(seed)
+        world = quiet()
+        zeros, speeds = Speaker(world, way, "zeros"), Speaker(world, way, "speeds")
+        zero_hz, speed_hz = dice.choice((5.0, 10.0, 30.0)), dice.choice((10.0, 20.0, 50.0))
+        due = [dice.uniform(0.0, 0.5), dice.uniform(0.0, 0.5)]
+        start_ns = world.now_ns
+        while min(due) < 5.0:
+            number = due.index(min(due))
+            at_ns = start_ns + int(due[number] * 1e9)
+            world.run(max(0.0, (at_ns - world.now_ns) / 1e9))
+            (zeros, speeds)[number].send((0.0, 0.5)[number])
+            due[number] += 1 / (zero_hz, speed_hz)[number] * dice.uniform(0.9, 1.1)
+        assert not moved(world, start_ns), seed
+
+
+@pytest.mark.parametrize("way", get_args(Way))
+def test_a_pause_arms_no_sender(way: Way) -> None:
+    """A sender that pauses after a `clear` and sends speeds again does not move the robot.
+
+    A user repeated `ros2 topic pub -r 10 /cmd_vel` after Ctrl-C, and the robot moved 2.0 m.
+    """
+    world, (speaker,) = cleared(way, "a")
+    since_ns = world.now_ns
+    for pause in (1.1, 1.1, 5.0):
+        speaker.hold(0.5, 1.0, 10.0)
+        world.run(pause)
+    speaker.hold(0.5, 1.0, 10.0)
+    assert not moved(world, since_ns)
+
+
+@pytest.mark.slow
+@each("way", OWN)
+def test_a_zero_of_an_unshared_identity_arms_immediately_even_right_after_speeds(way: Way) -> None:
+    world, (speaker,) = cleared(way, "a")
+    speaker.hold(0.4, 1.0)
+    assert world.state.mode == "ready"
+    speaker.hold(0.0, 0.05)
+    speaker.hold(0.4, 0.1)
+    assert world.state.mode == "driving"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("way", SHARED)
+def test_a_zero_of_a_shared_identity_arms_when_no_speed_has_followed_for_a_second(way: Way) -> None:
+    world, (speaker,) = cleared(way, "a")
+    speaker.hold(0.4, 1.0)
+    for quiet_s, mode in ((0.9, "ready"), (1.0, "driving")):
+        speaker.send(0.0)
+        world.run(quiet_s)
+        speaker.hold(0.4, 0.2)
+        assert world.state.mode == mode
+
+
+@each("way", get_args(Way))
+def test_a_sender_that_was_silent_for_ten_seconds_must_send_a_zero_again(way: Way) -> None:
+    """The first speed after an hour of silence moved the robot by 1.16 m in 3 s."""
+    world = quiet()
+    speaker = Speaker(world, way)
+    speaker.open()
+    world.run(10.5)
+    since_ns = world.now_ns
+    speaker.hold(0.4, 2.0)
+    assert not moved(world, since_ns)
+    assert world.state.code == "neutral"
+    speaker.send(0.0)
+    world.run(1.1)
+    speaker.hold(0.4, 0.3)
+    assert world.state.mode == "driving"
+
+
+def test_two_programs_with_a_gid_of_zeros_never_arm_each_other() -> None:
+    """They drove the robot by 2.18 m."""
+    world = quiet()
+    one, other = (Speaker(world, "rmw", "\0" * 16) for _ in range(2))
+    since_ns = world.now_ns
+    for number in range(100):
+        other.send(0.4)
+        world.run(0.02)
+        if number % 10 == 5:
+            one.send(0.0)
+        world.run(0.03)
+    assert not moved(world, since_ns)
+
+
+# neutral_first = "pause"
+
+
+def navigating(way: Way, name: str = "nav2") -> tuple[World, Speaker]:
+    """Return a world in which a pause counts, and a sender to the source `nav`."""
+    world = World()
+    world.run(6.5)
+    speaker = Speaker(world, way, name)
+    speaker.key = "cmd/nav"
+    return world, speaker
+
+
+@each("way", get_args(Way))
+def test_where_a_pause_arms_every_goal_drives_without_a_zero(way: Way) -> None:
+    world, nav = navigating(way)
+    for pause in (1.1, 12.0, 0.0):
+        nav.hold(0.4, 1.0)
+        assert world.state.mode == "driving", world.state.reason
+        nav.hold(0.0, 0.3)
+        world.run(pause)
+
+
+@each("event", ["clear", "deactivate", "link", "reset", "restart", "stall"])
+@each("way", ["rmw", "bridge", "client"])
+def test_where_a_pause_arms_a_goal_under_way_does_not_drive_after_an_event(
+    way: Way, event: str
+) -> None:
+    world, nav = navigating(way)
+    if event == "restart":
+        world = World()
+        nav.world = world
+        world.run(4.5)  # until its Zenoh client tries again
+    else:
+        nav.hold(0.4, 1.0)
+    match event:
+        case "clear":
+            world.call("stop")
+            nav.hold(0.4, 2.2)
+            assert world.call("clear").success
+        case "deactivate":
+            world.call("deactivate")
+            nav.hold(0.4, 2.2)
+            assert world.call("activate").success
+        case "link":
+            mcu = world.mcu
+            world.port.unplug()
+            nav.hold(0.4, 1.5)
+            world.port.plug(mcu)
+        case "reset":
+            world.mcu.reset(world.now_ns)
+            nav.hold(0.4, 1.5)
+        case "stall":
+            # The goal begins in a second that the daemon has not watched.
+            nav.hold(0.0, 0.2)
+            world.run(12.0)
+            world.stall(1.2)
+    since_ns = world.now_ns + NS_PER_S // 2 * (event in ("clear", "deactivate"))
+    nav.hold(0.4, 3.0)
+    assert not moved(world, since_ns)
+    assert world.state.code == "neutral", world.state.reason
+    world.run(1.1)
+    nav.hold(0.4, 0.5)  # the goal was cancelled and sent again
+    assert world.state.mode == "driving"
+
+
+# starts and returns
+
+ALONE: tuple[Way, ...] = ("header", "plain", "bridge", "routed")
+"""Routes on which all programs of a source have one identity."""
+
+
+def arrive(dice: random.Random) -> None:
+    """Let two senders start, and return after a silence, in random order.
+
+    Check that a speed without a zero moves nothing, and that each speed after a zero moves.
+    """
+    world = World()
+    world.run(dice.uniform(0.3, 3.0))
+    senders = [Speaker(world, dice.choice(get_args(Way)), name) for name in "ab"]
+    for speaker in senders:
+        speaker.ahead = dice.choice([0.0, -40.0, -3600.0])
+    same = all(speaker.way not in ALONE for speaker in senders)
+    senders[1].key = "cmd/app" if same else "cmd/teleop"
+    for silence in (0.0, dice.uniform(10.5, 14.0)):
+        world.run(silence)
+        dice.shuffle(senders)
+        for speaker in senders:
+            since_ns, zero = world.now_ns, dice.random() < 0.5
+            if zero:
+                for _ in range(dice.choice([1, 1, 5])):
+                    speaker.send(0.0)
+                    world.run(0.05)
+                world.run(1.1)
+            speaker.hold(0.4, 0.6, dice.choice([10.0, 20.0, 50.0]))
+            assert moved(world, since_ns) == zero, (speaker.way, silence, world.state.reason)
+            world.run(1.0)
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_of_two_senders_none_moves_unarmed_and_each_armed_one_moves(seed: int) -> None:
+    arrive(random.Random(seed))
+
+
+if __name__ == "__main__":
+    for seed in range(int(sys.argv[1])):
+        arrive(random.Random(seed))
