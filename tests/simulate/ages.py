@@ -102,10 +102,21 @@ class Clock:
         if confirms_ns > timeout_ns - MARGIN_NS:
             self._confirmed_ns = min(self._confirmed_ns, *(delay for _, delay in self._lower))
         if confirms_ns > 2 * timeout_ns + NS // 5:
-            # Now the robot surely knows the lower delays of the time before the last timeout.
-            known = [delay for then, delay in self._lower if at_ns - then > timeout_ns]
-            self.least = at_ns, min(known)
-            self._lower.clear()
+            # Now the robot surely knows the lower delays that commands a timeout later confirmed. A
+            # single wild stamp is confirmed by none.
+            known = [
+                delay
+                for then, delay in self._lower
+                if any(
+                    later - then > timeout_ns and abs(other - delay) < timeout_ns
+                    for later, other in self._lower
+                )
+            ]
+            if known:
+                self.least = at_ns, min(known)
+                self._lower.clear()
+            else:
+                del self._lower[0]
         return delay_ns >= min(least_ns, self._confirmed_ns) - SURELY_LOWER_NS
 
 

@@ -87,6 +87,13 @@ def test_a_delay_is_late_by_a_lower_one_only_if_that_has_stayed(
     assert fresh(ages, at_s, 1.1) is obeyed
 
 
+def test_one_wild_stamp_among_lower_delays_is_not_their_least() -> None:
+    ages = known(4.0, 1.0)
+    for n in range(60):
+        fresh(ages, 4.0 + n / 20, -1000.0 if n == 1 else 0.5)
+    assert fresh(ages, 7.0, 0.5)
+
+
 @pytest.mark.parametrize("lower_s", [0.05, 0.4])
 def test_a_lower_delay_that_may_count_stays_allowed_behind_a_higher_one(lower_s: float) -> None:
     ages = known(4.0, 1.0)
