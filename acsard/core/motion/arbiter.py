@@ -15,7 +15,7 @@ from msgspec import Struct, field
 
 from acsard.core.codes import AgeCode
 from acsard.core.config.settings import CommandsConfig, Source
-from acsard.core.motion.ages import MARGIN_NS, Ages, Order
+from acsard.core.motion.ages import MARGIN_NS, SILENT_NS, Ages, Order
 from acsard.core.motion.emergency_stop import CATCH_UP_NS, LATE_STEP_NS
 from acsard.core.motion.neutral import FOREVER_NS, NEUTRAL_PAUSE_NS, Hint, Sender, is_zero
 from acsard.core.values import NS_PER_S, REST, Command, Ns, SourceStatus, Twist, Wait
@@ -144,6 +144,8 @@ class Arbiter(Struct):
             quiet_ns = max(source.quiet_ns(sender), self.watched_ns)
             neutral = now_ns - quiet_ns >= NEUTRAL_PAUSE_NS
         sender.seen_ns = now_ns
+        if now_ns - sender.refused_ns > SILENT_NS:
+            sender.hint = None  # silence disarms also a sender whose zero was not proven yet
         if command.shared and not zero:
             for other in source.senders.values():
                 if other.shared:
