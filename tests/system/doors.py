@@ -45,6 +45,7 @@ from tests.system.ros_clients import (
     encode,
     joints,
     make,
+    rmw_key,
     stamped,
 )
 from tests.system.ros_clients import twist as ros_twist
@@ -408,6 +409,13 @@ class Rmw(Ros):
     def open(self) -> None:
         self.ros = RmwClient(self.bus.session)
 
+    def bad(self) -> dict[str, Send]:
+        put, key = self.bus.session.put, rmw_key("cmd_vel", TWIST)
+        return super().bad() | {
+            "no_attachment": lambda: put(key, ros_twist(0.5)),
+            "bad_attachment": lambda: put(key, ros_twist(0.5), attachment=b"rqh" + bytes(17)),
+        }
+
 
 class Bridge(Ros):
     """All nodes behind a bridge are one sender: no speed may follow its zero for a second."""
@@ -421,6 +429,12 @@ class Bridge(Ros):
     def arm(self) -> None:
         super().arm()
         time.sleep(1.1)
+
+    def bad(self) -> dict[str, Send]:
+        refused, between = super().bad(), ros_twist(0.5) + bytes(8)
+        if isinstance(self.ros, BridgeHalf):  # neither a Twist nor a TwistStamped
+            refused["wrong_shape"] = lambda: self.bus.session.put("cmd_vel", between)
+        return refused
 
 
 class RealBridge(Bridge):

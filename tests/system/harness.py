@@ -1,8 +1,30 @@
-"""Programs for the system tests: the daemon, an independent board, and a Zenoh client.
+"""A robot as any program sees it: processes, a board on a serial line, and a client of the bus.
 
-This module imports nothing of acsard. The tests see only the interfaces that any program sees: the
-wire, the bus and the shell. Every wait ends as soon as its condition holds, or fails at a deadline.
-Every process is ended by its own pid.
+This module imports nothing of acsard. The tests see only what any program sees: the wire, the bus
+and the shell. Every wait ends as soon as its condition holds, or fails at a deadline that a busy
+machine can meet. Every process is ended by its own pid.
+
+    with Peer(tmp_path / "mcu") as board, running(tmp_path, board.path) as (daemon, bus):
+        with bus.follow("state") as states, bus.commanding(0.3):
+            states.find(lambda state: state["mode"] == "driving", 2.0, "it drives")
+        bus.at_rest()
+        assert board.lines[-1].line == ZERO_LINE
+
+- Waiting: `until(look, within, what)`; `Following.find` waits for a message; `Program.says` for a
+  line of output. Never sleep for an event.
+- Processes: `Program` (any), `Daemon` (`acsard run` with its own configuration, address and latch
+  file), `finish` (to its end), `acsard(...)` (a command line). `typed.py` runs a command in the
+  test's process.
+- The board: `Peer` is in the test's process, `FarPeer` has a process and reliable times. Both keep
+  each line and its time. `Peer.unplug`, `plug`, `deaf` and `reply` are its faults.
+- The bus: `Bus` puts JSON (`put`), asks (`ask` for all replies, `get` for the one), follows
+  keys (`follow`), and waits for the robot (`linked`, `at_rest`, `stands`, `comes_to`).
+  `Bus.commanding` drives; `repeated` sends anything 20 times a second.
+- A busy machine: compare a time with `bystander.lost(since)`, which this machine lost meanwhile,
+  and with `kept_waiting(pid)`, which the threads of a process waited for a core. `broken` says
+  whether the link was lost although no test cut it; `Periods` counts control periods.
+- `shared` and `bus` in `conftest.py` are one robot for all tests of a module, for tests that leave
+  it at rest. A module's `CONFIG` is its configuration.
 """
 
 from __future__ import annotations
@@ -33,9 +55,6 @@ from typing import Any, NamedTuple, TypeVar
 import msgspec
 import zenoh
 
-from acsard.core.messages.keys_and_roles import command_key
-from acsard.core.messages.refusals import BUSY_ENCODING
-
 T = TypeVar("T")
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -51,6 +70,9 @@ A wait measures nothing: tests compare durations with `bystander.lost`.
 
 END_S = 5.0
 """A daemon that has not ended by then is killed, and the test fails by its exit code."""
+
+BUSY_ENCODING = "text/plain;busy"
+"""Of the reply of a daemon that has too many open queries: ask again."""
 
 ZERO_LINE = b"ap00.00,bp00.00,cp00.00,dp00.00\r\n"
 
@@ -830,7 +852,8 @@ class Bus:
         certificate: str = "",
     ) -> Iterator[Commander]:
         """Send commands at 20 Hz while the body runs. A zero comes first if `neutral` is set."""
-        commander = Commander(self, command_key("cmd", source, certificate), linear, angular)
+        key = "/".join(filter(None, ("cmd", source, certificate)))
+        commander = Commander(self, key, linear, angular)
         if neutral:
             before, said = self.count("commands"), 0.0
 
@@ -851,12 +874,8 @@ class Bus:
                 return not neutral and counters.get("commands", 0) > before
 
             until(heard, 5.0, "the zero was received")
-        commander.thread.start()
-        try:
+        with commander.sending():
             yield commander
-        finally:
-            commander.silenced.set()
-            commander.thread.join()
 
 
 @contextmanager
@@ -886,12 +905,11 @@ class Commander:
         self.wish = twist(linear, angular)
         self.silenced = threading.Event()
         self._bus = bus
-        self.thread = threading.Thread(target=self._send)
 
-    def _send(self) -> None:
-        while not self.silenced.is_set():
-            self._bus.put(self.key, self.wish, self.sender)
-            self.silenced.wait(0.05)
+    @contextmanager
+    def sending(self) -> Iterator[None]:
+        with repeated(lambda: self._bus.put(self.key, self.wish, self.sender)) as self.silenced:
+            yield
 
 
 class Periods(NamedTuple):

@@ -35,6 +35,7 @@ from tests.system.harness import (
     client_config,
     environment,
     free_endpoint,
+    repeated,
     until,
 )
 from tests.system.strangers import ROUTER, command_line
@@ -421,23 +422,11 @@ class Client(ABC):
     def driving(self, bus: Bus, name: str, type_name: str, speed: float) -> Iterator[None]:
         """Send a zero first, and then this speed at 20 Hz while the body runs."""
         self.publish_until_accepted(bus, name, type_name, lambda: PAYLOADS[type_name](0.0))
-        silenced = threading.Event()
         if not isinstance(self, RmwClient):
             # All nodes behind a bridge are one sender: no speed may follow its zero for a second.
-            silenced.wait(1.1)
-
-        def send() -> None:
-            while not silenced.is_set():
-                self.put(name, type_name, PAYLOADS[type_name](speed))
-                silenced.wait(0.05)
-
-        thread = threading.Thread(target=send)
-        thread.start()
-        try:
+            time.sleep(1.1)
+        with repeated(lambda: self.put(name, type_name, PAYLOADS[type_name](speed))):
             yield
-        finally:
-            silenced.set()
-            thread.join()
 
 
 class ZenohClient(Client):

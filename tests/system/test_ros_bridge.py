@@ -5,7 +5,6 @@ These tests emulate the bridge. `test_ros_dds.py` tests the real bridge.
 
 from __future__ import annotations
 
-import struct
 import time
 from pathlib import Path
 
@@ -26,7 +25,6 @@ from tests.system.ros_clients import (
     changes,
     decode,
     listed,
-    refused_without_motion,
     session_at,
     stamped,
     twist,
@@ -68,28 +66,6 @@ def test_a_twist_has_52_bytes_and_a_stamped_twist_76(bus: Bus, ros: BridgeHalf) 
 
 
 # bad messages
-
-
-GO = twist(0.5)
-
-BAD = {
-    "between both": ("cmd_vel", GO + bytes(8), "wrong_shape", "neither a Twist"),
-    "NaN, big endian": (
-        "cmd_vel", b"\0\0\0\0" + struct.pack(">6d", 0.5, 0, 0, 0, 0, float("nan")),
-        "not_finite", "NaN",
-    ),
-    "a twist for joints": ("joint_commands", GO, "malformed", ""),
-}  # fmt: skip
-"""The topic, the payload, the counter of the refusal and a word of the logged reason."""
-
-
-@pytest.mark.parametrize("name", BAD)
-def test_a_payload_of_no_known_type_is_counted_and_reported_and_moves_nothing(
-    bus: Bus, ros: BridgeHalf, name: str
-) -> None:
-    topic, payload, reason, text = BAD[name]
-    ros.zeros(bus)
-    refused_without_motion(bus, lambda: ros.session.put(topic, payload), reason, text)
 
 
 def test_the_bridge_keys_ignore_an_attachment(bus: Bus, ros: BridgeHalf) -> None:

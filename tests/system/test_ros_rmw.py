@@ -5,7 +5,7 @@ from __future__ import annotations
 import queue
 import struct
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import AbstractContextManager, ExitStack
 from functools import partial
 from pathlib import Path
@@ -21,7 +21,6 @@ from tests.system.ros_clients import (
     JOINTS,
     LIST,
     ODOMETRY,
-    PAYLOADS,
     PUBLISHED,
     QUICK,
     SERVICES,
@@ -43,14 +42,9 @@ from tests.system.ros_clients import (
     decode,
     encode,
     gid_of,
-    joints,
-    listed,
     make,
     over_router,
-    refused_without_motion,
     rmw_key,
-    settled,
-    stamped,
     twist,
     two_robots,
     undisturbed,
@@ -344,28 +338,6 @@ def test_a_reply_names_its_request(bus: Bus, ros: RmwClient) -> None:
 GO = twist(0.5)
 NOW = Attached(1, time.time_ns(), bytes(16)).pack()
 
-ATTACHED = {
-    "none": (b"", "no_attachment", "attachment"),
-    "the bridge's": (b"rqh" + bytes(17), "bad_attachment", "20 bytes"),
-    "a GID too short": (NOW[:16] + b"\x0f" + bytes(16), "bad_attachment", "15"),
-    "a GID too long": (NOW[:16] + b"\x11" + bytes(17), "bad_attachment", "34"),
-    "one byte short": (NOW[:-1], "bad_attachment", "32"),
-    "60 kB": (bytes(60_000), "bad_attachment", "instead of 33"),
-}
-"""Attachments with the counter of the refusal and a word of the logged reason."""
-
-
-@pytest.mark.parametrize("name", ATTACHED)
-def test_a_command_with_a_wrong_attachment_is_counted_and_reported_and_moves_nothing(
-    bus: Bus, ros: RmwClient, name: str
-) -> None:
-    attachment, reason, text = ATTACHED[name]
-    ros.zeros(bus)
-    key = ros.key("cmd_vel", TWIST)
-    refused_without_motion(
-        bus, lambda: ros.session.put(key, GO, attachment=attachment or None), reason, text
-    )
-
 
 def test_a_command_of_a_sender_whose_clock_is_an_hour_off_is_accepted(
     bus: Bus, ros: RmwClient
@@ -398,42 +370,6 @@ def test_a_put_with_another_type_hash_is_ignored(bus: Bus, ros: RmwClient) -> No
     assert after["wheels"] == before["wheels"]
 
 
-PLAIN: dict[str, tuple[str, Callable[[], bytes]]] = {
-    "big endian": (TWIST, lambda: b"\0\0\0\0" + struct.pack(">6d", 0, 0, 0, 0, 0, 0)),
-    "surplus bytes": (TWIST, lambda: twist(0.0) + b"\xff\xff\xff"),
-    "padding that says so": (TWIST, lambda: b"\0\1\0\3" + twist(0.0)[4:] + bytes(3)),
-    "no frame": (STAMPED, lambda: stamped(0.0, age=None).replace(b"base_link", bytes(9))),
-    "surplus bytes, stamped": (STAMPED, lambda: stamped(0.0) + bytes(4)),
-    "joints without a stamp": (JOINTS, lambda: joints(0.0)),
-    "joints in another order": (JOINTS, lambda: joints(0.0, WHEELS[::-1])),
-}
-
-
-@pytest.mark.parametrize("name", PLAIN)
-def test_unusual_but_valid_encodings_are_accepted(bus: Bus, ros: RmwClient, name: str) -> None:
-    kind, payload = PLAIN[name]
-    before = bus.state()
-    ros.publish_until_accepted(
-        bus, "joint_commands" if kind == JOINTS else "cmd_vel", kind, payload
-    )
-    assert changes(before, bus.state()).keys() <= {"commands", "commands_of_new_senders"}
-
-
-def test_a_big_endian_twist_says_the_same_speed(bus: Bus, ros: RmwClient) -> None:
-    payload = b"\0\0\0\0" + struct.pack(">6d", 0.2, 0, 0, 0, 0, 0)
-    ros.publish_until_accepted(bus, "cmd_vel", TWIST, twist(0.0))
-    with bus.follow("cmd_vel_out") as applied:
-        end = time.monotonic() + 3.0
-        while time.monotonic() < end:
-            ros.publish_until_accepted(bus, "cmd_vel", TWIST, payload)
-            if applied.seen and applied.seen[-1].value["twist"]["linear"]["x"] > 0.199:
-                break
-        assert max(s.value["twist"]["linear"]["x"] for s in applied.seen) == pytest.approx(
-            0.2, abs=1e-3
-        )
-    settled(bus)
-
-
 @pytest.mark.parametrize(
     ("attachment", "reason"),
     [(b"", "no_attachment"), (bytes(20), "bad_attachment"), (NOW[:-1], "bad_attachment")],
@@ -459,20 +395,6 @@ def test_a_stop_without_attachment_stops_all_the_same(bus: Bus, ros: RmwClient) 
         assert changes(before, bus.state()) == {"command_no_attachment": 1}
     finally:
         bus.get("srv/clear")
-
-
-@pytest.mark.parametrize(
-    "request_bytes", [b"", b"\0\1", b"\0\1\0\0", b"\0\1\0\0\xff\xff\xff\xff", b"\0\7\0\0\0\0\0\0"]
-)
-def test_an_invalid_parameter_request_is_counted_and_gets_an_empty_answer(
-    bus: Bus, ros: RmwClient, request_bytes: bytes
-) -> None:
-    before = bus.state()
-    called = ros.call("acsard/get_parameters", GET, request_bytes)
-    (reply,) = called.replies
-    assert decode("rcl_interfaces/msg/GetReply", reply.payload).values == []
-    assert called.seconds < 1.0
-    assert changes(before, bus.state()) == {"command_malformed": 1}
 
 
 def test_more_names_than_there_are_parameters_are_answered(ros: RmwClient) -> None:
@@ -505,21 +427,6 @@ def test_each_of_many_simultaneous_calls_is_answered(
         )
     assert [answers.get(timeout=20.0) for _ in asked] == [True] * count
     bus.state()
-
-
-def test_a_topic_of_a_source_that_is_not_listed_is_refused(tmp_path: Path) -> None:
-    only = {"[commands.sources]": {"name": "teleop", "priority": 9, "timeout": 0.25}}
-    with Daemon(tmp_path, config=only) as daemon, Bus(daemon.endpoint) as bus:
-        ros = RmwClient(bus.session)
-        bus.linked()
-        ros.publish_until_accepted(bus, "cmd_vel_teleop", TWIST, twist(0.0))
-        for topic, kind, text in (
-            ("cmd_vel", TWIST, "commands.sources"),
-            ("joint_commands", JOINTS, "ros2_control"),
-        ):
-            payload = PAYLOADS[kind](0.5)
-            send = partial(ros.put, topic, kind, payload)
-            refused_without_motion(bus, send, "unknown_source", text)
 
 
 def test_no_ros_client_raised_an_exception_in_the_daemon(bus: Bus, shared: Daemon) -> None:
@@ -583,9 +490,3 @@ def test_no_key_is_published_by_two_robots(fleet: Fleet) -> None:
         by_robot.setdefault("one" if "one" in key.split("/") else "two", set()).update(origins)
     assert {len(origins) for origins in by_robot.values()} == {1}
     assert by_robot["one"] != by_robot["two"]
-
-
-def test_two_robots_are_two_nodes(fleet: Fleet) -> None:
-    with listed(fleet.one.session, "@ros2_lv/0/*/*/*/NN/*/*/acsard") as nodes:
-        until(lambda: len(nodes) == 2, 5.0, "two nodes")
-        assert {node.split("/")[-2] for node in nodes} == {"%one", "%two"}

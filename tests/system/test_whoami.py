@@ -10,9 +10,9 @@ from threading import Thread, Timer
 
 import pytest
 
-from acsard.client import connect, connect_async
+from acsard.client import connect
 from acsard.core.values import ROLES
-from acsard.host.errors import NoAnswerError, NotPermittedError
+from acsard.host.errors import NoAnswerError
 from tests.system.harness import (
     Bus,
     Daemon,
@@ -88,22 +88,6 @@ def test_doctor_reports_an_unlisted_certificate(robot: Robot) -> None:
     ended = robot.tool("unlisted", "doctor")
     assert ended.code == 1
     assert SILENCE in ended.out
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    "words",
-    [
-        ("get", "state"),  # `call` and `top` ask in the same way
-        ("echo", "state", "--timeout", "0.1"),
-    ],
-    ids=lambda words: words[0],
-)
-@pytest.mark.nightly
-def test_tools_say_that_the_certificate_is_unlisted(robot: Robot, words: tuple[str, ...]) -> None:
-    ended = robot.tool("unlisted", *words)
-    assert ended.code != 0
-    assert SILENCE in ended.err
 
 
 @pytest.mark.slow
@@ -212,31 +196,6 @@ def test_foxglove_with_a_viewer_s_certificate_shows_and_stops_the_robot(robot: R
         assert bus.get("srv/clear")["success"]
 
 
-@pytest.mark.slow
-def test_a_viewer_s_drive_raises_an_error_with_the_certificate_s_permissions(robot: Robot) -> None:
-    with (
-        connect(robot.tls, tls=robot.own("viewer")) as client,
-        pytest.raises(
-            NotPermittedError, match=r"certificate viewer has the role viewer: .* not drive"
-        ),
-    ):
-        client.drive(0.3, seconds=1.0)
-
-
-async def _drive(robot: Robot) -> None:
-    async with connect_async(robot.tls, tls=robot.own("viewer")) as client:
-        await client.drive(0.3, seconds=1.0)
-
-
-@pytest.mark.slow
-@pytest.mark.nightly
-def test_an_async_drive_of_a_viewer_raises_not_permitted(robot: Robot) -> None:
-    import asyncio
-
-    with pytest.raises(NotPermittedError, match="has the role viewer"):
-        asyncio.run(_drive(robot))
-
-
 @pytest.mark.parametrize(
     ("identity", "code", "text"),
     [
@@ -275,10 +234,3 @@ def test_a_request_that_a_viewer_may_not_make_is_refused_with_the_role_it_needs(
     assert (ended.code, ended.out) == (77, "")
     assert "certificate viewer has the role viewer" in ended.err
     assert f"needs at least the role {least}" in ended.err
-
-
-def test_an_operator_drives_over_tls_and_reads_the_new_pose(robot: Robot) -> None:
-    with connect(robot.tls, tls=robot.own("operator")) as client:
-        before = client.pose().x
-        client.drive(0.3, seconds=0.5)
-        assert client.pose().x > before + 0.02
