@@ -20,7 +20,7 @@ from acsard.cli import UNLISTED, VERBS
 from acsard.host.version import commit_of
 from deploy.release import contents
 from tests.pages import ROOT
-from tests.unit.calibration.logs import usual
+from tests.unit.calibration_logs import usual
 
 pytestmark = [
     pytest.mark.slow,

@@ -14,7 +14,7 @@ from acsard.cli import parser
 from acsard.core.config.parsing import parse
 from acsard.host.errors import Exit, MendableError, UnreachableError
 from acsard.terminal import prompt
-from tests.unit.calibration.logs import usual
+from tests.unit.calibration_logs import usual
 
 GOOD = usual().csv(places=False)
 

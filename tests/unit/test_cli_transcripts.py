@@ -27,7 +27,7 @@ from acsard.machine.authority import Authority
 from tests.scenarios.taped import Tape, recorded_world
 from tests.scenarios.world import World
 from tests.system.typed import typed
-from tests.unit.calibration.logs import usual
+from tests.unit.calibration_logs import usual
 
 PLACE = Path(__file__).with_name("words") / "transcripts"
 

@@ -35,7 +35,7 @@ from acsard.recording.export import (
 from acsard.recording.file import Recording
 from tests.scenarios.taped import BATCH, Tape, recorded_world
 from tests.scenarios.world import START
-from tests.unit.calibration.bags import converted
+from tests.unit.calibration_bags import converted
 from tests.unit.drives import CONFIG, drive
 
 SECONDS = (drive().taken[-1].now.mono_ns - START.mono_ns) / 1e9

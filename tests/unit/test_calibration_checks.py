@@ -11,8 +11,8 @@ import pytest
 from acsard.calibration.log import Log, LogError
 from acsard.calibration.result import Result, calibrate
 from acsard.core.config.settings import Config
-from tests.unit.calibration.logs import run, usual
-from tests.unit.calibration.robots import Drive
+from tests.unit.calibration_logs import run, usual
+from tests.unit.calibration_robots import Drive
 
 TRIP = usual()
 

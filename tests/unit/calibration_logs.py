@@ -10,7 +10,7 @@ import numpy as np
 from acsard.calibration.fit import TRACK, Fit, fit
 from acsard.calibration.log import Notes, Run, run_of
 from acsard.core.config.settings import Config
-from tests.unit.calibration.robots import GUIDED, Drive, Floats, Plan, Robot, drive
+from tests.unit.calibration_robots import GUIDED, Drive, Floats, Plan, Robot, drive
 
 IDEAL = {
     "rate": 0.0, "slip": 0.0, "late": 0.0, "bias": 0.0, "gyro_noise": 0.0, "place_noise": 0.0,

@@ -30,8 +30,8 @@ from acsard.calibration.result import calibrate
 from acsard.core.config.settings import Config, DriveConfig, OdometryConfig
 from acsard.core.link.feedback import Feedback
 from acsard.core.values import WheelSpeeds
-from tests.unit.calibration.logs import WAYS, run, runs
-from tests.unit.calibration.robots import (
+from tests.unit.calibration_logs import WAYS, run, runs
+from tests.unit.calibration_robots import (
     RADIUS,
     SEPARATION,
     Drive,

@@ -15,8 +15,8 @@ from msgspec import structs
 from acsard.calibration.fit import BIAS, GYRO_DELAY, fit, gyro_bias
 from acsard.calibration.log import LogError, TapeReading
 from acsard.core.config.settings import Config, DriveConfig
-from tests.unit.calibration.logs import WAYS, fitted, ideal, multipliers, run, runs, usual
-from tests.unit.calibration.robots import (
+from tests.unit.calibration_logs import WAYS, fitted, ideal, multipliers, run, runs, usual
+from tests.unit.calibration_robots import (
     GUIDED,
     RADIUS,
     SEPARATION,

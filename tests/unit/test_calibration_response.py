@@ -10,7 +10,7 @@ from acsard.calibration.log import Log, LogError, Run
 from acsard.calibration.response import response_time
 from acsard.calibration.result import calibrate
 from acsard.core.config.settings import Config, DriveConfig, FeedbackConfig
-from tests.unit.calibration.logs import run, usual
+from tests.unit.calibration_logs import run, usual
 
 
 def commanded(lag: float, fastest: float = 99.0, cut: bool = False) -> Run:

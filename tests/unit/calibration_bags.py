@@ -27,7 +27,7 @@ LEFT_JOINTS, RIGHT_JOINTS = list(WHEELS[0::2]), list(WHEELS[1::2])
 STEP = 0.002
 JOINT_HZ, IMU_HZ = 50, 50
 
-SCRIPT = Path(__file__).parents[3] / "deploy" / "calibration" / "bag_to_csv.py"
+SCRIPT = Path(__file__).parents[2] / "deploy" / "calibration" / "bag_to_csv.py"
 script = runpy.run_path(str(SCRIPT))
 
 

@@ -1,11 +1,16 @@
-"""Situations of real logs, each with its right value or with the cause that must be named."""
+"""Situations of real logs, each with its right value or with the cause that must be named.
+
+`-s -m "slow or not slow"` prints them as a table.
+"""
 
 from __future__ import annotations
 
+import os
 import shlex
 import subprocess
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -14,8 +19,8 @@ import pytest
 from acsard.calibration.log import LogError, read
 from acsard.calibration.result import Result, calibrate
 from acsard.core.config.settings import Config
-from tests.unit.calibration import bags
-from tests.unit.calibration.bags import (
+from tests.unit import calibration_bags as bags
+from tests.unit.calibration_bags import (
     END,
     RADIUS,
     SCRIPT,
@@ -38,9 +43,24 @@ def found(data: bytes) -> Result:
     return calibrate(read(data), Config(), "drive.csv")
 
 
+def row(found: str) -> None:
+    name = os.environ["PYTEST_CURRENT_TEST"].split("::")[1].split(" ")[0]
+    print(f"\n| {name.removeprefix('test_').replace('_', ' ')} | {found} |")
+
+
+@contextmanager
+def refused(cause: str, error: type[BaseException] = LogError) -> Iterator[None]:
+    with pytest.raises(error, match=cause) as caught:
+        yield
+    row(f"refused: {caught.value}")
+
+
 def require(result: Result, truth: Sequence[float], within: float = 0.008) -> None:
     values = list(result.found.values())
-    print(dict(zip(result.found, values, strict=True)), list(result.deviations.values()))
+    row(", ".join(
+        f"{value:.4f} +- {deviation:.4f} ({true:.4f})"
+        for value, deviation, true in zip(values, result.deviations.values(), truth, strict=True)
+    ))  # fmt: skip
     assert result.better
     assert values == pytest.approx(truth, abs=within)
     # The noise never states more than a few degrees for a sound log.
@@ -75,7 +95,7 @@ def test_zeros_of_a_second_publisher_are_refused_with_the_cause(tmp_path: Path, 
         made.joints(START + t + late, START + t + late - 0.002, WHEELS, [0.0] * 4)
 
     directory = bag(joint).write(tmp_path / "drive")
-    with pytest.raises(SystemExit, match=r"two series of angles alternate.*joint_state_publisher"):
+    with refused(r"two series of angles alternate.*joint_state_publisher", SystemExit):
         converted(directory, *GYRO)
 
 
@@ -83,7 +103,7 @@ def test_speeds_with_zeros_of_a_second_program_are_refused_with_the_cause() -> N
     t = np.arange(0, END, 0.02)
     speeds = np.where(np.arange(len(t)) % 2, 0.0, at("left", t))
     lines = [f"{a:.3f},{b:.4f},{b:.4f},{at('w', a):.4f}" for a, b in zip(t, speeds, strict=True)]
-    with pytest.raises(LogError, match="in column left, every other value is 0: two programs"):
+    with refused("in column left, every other value is 0: two programs"):
         found(rows("t,left,right,yaw_rate", lines))
 
 
@@ -129,7 +149,7 @@ def test_the_command_of_the_page_converts_a_bag(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("column", ["left (in/s)", "left_ips", "left [rpm]"])
 def test_a_unit_in_the_header_is_an_error_with_the_right_unit(column: str) -> None:
-    with pytest.raises(LogError, match=r"name it left, and write its values in rad/s"):
+    with refused(r"name it left, and write its values in rad/s"):
         found(rows(f"t,{column},right,yaw_rate", ["0.0,1.0,1.0,0.0"]))
 
 
@@ -154,7 +174,7 @@ def test_a_clock_that_is_set_back_in_a_bag_is_a_cause_that_is_named(tmp_path: Pa
         made.joints(set_back(t) + 0.002, set_back(t), WHEELS, [left, right] * 2)
 
     directory = bag(joint, lambda made, t, w: made.imu(set_back(t) + 0.002, set_back(t), w))
-    with pytest.raises(SystemExit, match="clock was set back"):
+    with refused("clock was set back", SystemExit):
         converted(directory.write(tmp_path / "drive"), *GYRO)
 
 
@@ -193,7 +213,7 @@ def test_sides_that_are_copied_in_a_csv_file_are_refused_with_the_cause() -> Non
         f"{t:.3f},{at('right', t):.4f},{at('right', t):.4f},{at('w', t):.5f}"
         for t in np.arange(0, END, 0.02)
     ]
-    with pytest.raises(LogError, match="left and right are the same in every row"):
+    with refused("left and right are the same in every row"):
         found(rows("t,left,right,yaw_rate", lines))
 
 
@@ -206,7 +226,7 @@ def test_encoders_without_direction_are_named_as_the_cause(tmp_path: Path) -> No
         made.joints(START + time + 0.002, START + time, WHEELS, angles)
 
     data = converted(bag(joint).write(tmp_path / "drive"), *GYRO)
-    with pytest.raises(LogError, match=r"never turn backwards.*encoders with one channel"):
+    with refused(r"never turn backwards.*encoders with one channel"):
         found(data)
 
 
@@ -222,7 +242,7 @@ def test_poses_whose_y_axis_points_up_need_the_option_that_the_error_names(tmp_p
     made = bag(gyro=None, pose_hz=20.0, pose=lambda b, t, x, y, yaw: b.pose(
         START + t, START + t, (x, 0.02, -y), yaw, axis=1))  # fmt: skip
     directory = made.write(tmp_path / "drive")
-    with pytest.raises(SystemExit, match=r"turn about their y axis.*add --up y"):
+    with refused(r"turn about their y axis.*add --up y", SystemExit):
         converted(directory, *POSES)
     require(found(converted(directory, *POSES, "--up", "y")), BY_POSES)
 
@@ -304,16 +324,16 @@ def test_two_frames_on_a_topic_are_refused_with_the_cause(tmp_path: Path) -> Non
         made.imu(START + t + 0.001, START + t, 0.0, "lidar_imu")
 
     made = bag(gyro=gyro).write(tmp_path / "drive")
-    with pytest.raises(SystemExit, match="imu_link and lidar_imu, so two programs"):
+    with refused("imu_link and lidar_imu, so two programs", SystemExit):
         converted(made, *GYRO)
 
 
 def test_a_topic_or_joint_that_is_missing_is_named(tmp_path: Path) -> None:
     directory = bag(gyro=None).write(tmp_path / "drive", sqlite=True)
-    with pytest.raises(SystemExit, match=r"no topic /imu/data; its topics are /joint_states"):
+    with refused(r"no topic /imu/data; its topics are /joint_states", SystemExit):
         converted(directory, *GYRO)
     words = [str(directory), "unused", "--wheels", "/joint_states", "--left", "wheel", "--right"]
     args = bags.script["parser"].parse_args([*words, WHEELS[1]])
-    with pytest.raises(SystemExit, match="no joint wheel; the joints are front_left_wheel_joint"):
+    with refused("no joint wheel; the joints are front_left_wheel_joint", SystemExit):
         bags.script["convert"](args)
     assert Config().drive.wheel_radius == RADIUS

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from acsard.calibration.log import LogError, read, with_distance
-from tests.unit.calibration.logs import run, usual
-from tests.unit.calibration.robots import Robot, drive
+from tests.unit.calibration_logs import run, usual
+from tests.unit.calibration_robots import Robot, drive
 
 HEADER = "t,left,right,yaw_rate"
 
