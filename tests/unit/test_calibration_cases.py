@@ -1,6 +1,6 @@
 """Situations of real logs, each with its right value or with the cause that must be named.
 
-`-s -m "slow or not slow"` prints them as a table.
+`-n 0 -s -m "slow or not slow"` prints them as a table.
 """
 
 from __future__ import annotations

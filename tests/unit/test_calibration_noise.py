@@ -1,6 +1,6 @@
 """The geometry and the noise from the calibration of a log also describe other drives.
 
-`-m "soak or not soak" -s` prints the table of `deploy/calibration`. A row describes the robots of
+`-n 0 -s -m "soak or not soak"` prints the table of `deploy/calibration`. A row describes the robots of
 one kind by these figures:
 
 - the NEES with three degrees of freedom after drives of a minute, with the fitted noise and with
