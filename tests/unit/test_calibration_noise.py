@@ -1,7 +1,7 @@
 """The geometry and the noise from the calibration of a log also describe other drives.
 
-`-n 0 -s -m "soak or not soak"` prints the table of `deploy/calibration`. A row describes the robots of
-one kind by these figures:
+`-n 0 -s -m "soak or not soak"` prints the table of `deploy/calibration`. A row describes the robots
+of one kind by these figures:
 
 - the NEES with three degrees of freedom after drives of a minute, with the fitted noise and with
   the default noise,
