@@ -49,7 +49,10 @@ def removed(plan: Plan) -> Plan:
     }
 
 
-NEW = {"flip", "half_duplex", "constant_answers", "gyro", "runaway", "set_points", "gain"}
+NEW = {
+    "flip", "half_duplex", "constant_answers", "gyro", "runaway", "set_points", "gain",
+    "replies_twice",
+}  # fmt: skip
 """Events and faults that an older simulator does not know."""
 
 
@@ -593,6 +596,7 @@ MOMENTS: dict[str, tuple[float, Callable[[Plan], bool], Callable[[Plan, random.R
     "wrong counts": (0.03, _any, _driven(moments_of_wheels.wrong_counts)),
     "set points": (0.05, _is_plain, _driven(moments_of_wheels.set_points)),
     "stuck encoder": (0.03, _is_plain, _driven(moments_of_wheels.stuck_encoder)),
+    "replies twice": (0.03, _is_plain, _driven(moments_of_wheels.replies_twice)),
 }
 """The share of the plans that have each moment, of those that can have it, whether a plan can have
 it, and what makes it."""

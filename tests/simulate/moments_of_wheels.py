@@ -115,6 +115,15 @@ def stuck_encoder(plan: Plan, dice: random.Random, driver: Sender) -> None:
     plan["events"] = events
 
 
+def replies_twice(plan: Plan, dice: random.Random, driver: Sender) -> None:
+    """Let a repeater send each reply of a checked link twice."""
+    config = plan["config"]
+    config.get("odometry", {}).pop("gyro", None)
+    config["control"]["rate"] = 50.0
+    config["mcu"]["link_check"] = "on"
+    plan["board"] = [["replies_twice"]]
+
+
 def wrong_counts(plan: Plan, dice: random.Random, driver: Sender) -> None:
     """Let the configuration name a wrong number of counts on a link with a check."""
     config = plan["config"]

@@ -28,6 +28,7 @@ PLANS_OF_FAULT = {
     "replay": "recorded", "lines endless": "endless", "wheel reversed": "reversed_motor",
     "wheel runaway": "slow wheels", "wheel fast": "gain",
     "wheel blocked": "dead_motor",
+    "answers twice": "replies twice",
     "wheel stuck": "stuck encoder", "counts wrong": "wrong counts",
     "session gap": "mute", "session stale": "mute", "odometry silent": "mute",
     "odometry gap": "mute",
@@ -35,7 +36,7 @@ PLANS_OF_FAULT = {
     "session echo": "half_duplex", "case 11": "echo", "limits clock": "wall",
     "robot unsent": "block", "robot limits": "limits", "lifecycle number": "typed",
     "lifecycle fault": "driver_fault", "ages echo": "queue from the start",
-    "gyro hangs": "hangs",
+    "gyro hangs": "hangs", "odometry still": "mute",
 }  # fmt: skip
 """Kinds of plans by the name of a fault, or by the first word of its name."""
 
@@ -433,6 +434,29 @@ FAULTS = (
         LIFECYCLE,
         'self._require_shown(causes, asked_ns, "clear")',
         'self.latches.of("fault") or self._require_shown(causes, asked_ns, "clear")',
+    ),
+    fault(
+        "lifecycle first",
+        "a clear that names two causes releases only one of them",
+        LIFECYCLE,
+        "for cause in causes if cause.number in numbers]",
+        "for cause in causes if cause.number in numbers][:1]",
+    ),
+    fault(
+        "lifecycle more",
+        "an activate releases a stop, too",
+        LIFECYCLE,
+        'return self._release(numbers, causes, "activate")',
+        'stops = self.latches.of("stop", "inactive")\n'
+        "        numbers = [*numbers, *[cause.number for cause in stops]]\n"
+        '        return self._release(numbers, stops, "activate")',
+    ),
+    fault(
+        "lifecycle shown",
+        "a clear that names no cause works only after four seconds",
+        LIFECYCLE,
+        "SHOWN_S = 2.0",
+        "SHOWN_S = 4.0",
     ),
     fault(
         "lifecycle off",
@@ -883,6 +907,36 @@ FAULTS = (
         '[replace(cause, kept=True) for cause in latches.causes if cause.kind != "fault"]',
     ),
     # gyro
+    fault(
+        "latches number",
+        "a restart begins again to count the causes from 1",
+        "daemon/latch_file.py",
+        "return after_restart(Latches(causes, last + 1 + secrets.randbits(32)))",
+        "return after_restart(Latches(causes, max([c.number for c in causes], default=0)))",
+    ),
+    fault(
+        "odometry still",
+        "behind a silence the heading of a robot that stands is 0.3 rad off",
+        ODOMETRY,
+        "        self.travelled += abs(distance)\n",
+        "        angle += 0.3 if gap and at_rest and gap.unknown > 0.5 else 0.0\n"
+        "        self.travelled += abs(distance)\n",
+    ),
+    fault(
+        "odometry wraps",
+        "x of the pose goes from 1 m to -1 m",
+        ODOMETRY,
+        "self.pose = Pose(pose.x + dx, pose.y + dy, yaw)",
+        "self.pose = Pose(math.remainder(pose.x + dx, 2.0), pose.y + dy, yaw)",
+    ),
+    fault(
+        "answers twice",
+        "replies that arrive twice never let the link come up",
+        "core/link/checked_line.py",
+        "again = reply.sequence in self.last",
+        "again = False",
+        Edit("core/link/link_state.py", "CHECKED_LINES = 3, 1", "CHECKED_LINES = 3, 2"),
+    ),
     fault(
         "wheel stuck",
         "a wheel that seems not to turn is neither left out nor named",

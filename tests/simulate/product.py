@@ -444,7 +444,7 @@ class Product:
             if name == "constant_answers":
                 self._lasting.enter_context(mcu._with(_processing=repeat(values[0])))
                 continue
-            if name in ("half_duplex", "runaway", "set_points", "gain"):
+            if name in ("half_duplex", "runaway", "set_points", "gain", "replies_twice"):
                 continue
             # The daemon's TX is joined to its RX, so nothing of the board arrives.
             fault = "mute" if name == "echo" else name
@@ -456,6 +456,8 @@ class Product:
                 self._half_duplex(mcu, *values)
             if name == "set_points":
                 self._report_set_points(mcu)
+            if name == "replies_twice":
+                self._reply_twice(mcu)
             if name == "gain":
                 self._lasting.enter_context(mcu._with(drives=[values[0]] * 4))
         self._run_away(mcu, [values[0] for name, values in faults if name == "runaway"])
@@ -515,6 +517,18 @@ class Product:
 
         vars(mcu)["_speeds"] = speeds
         self._lasting.callback(vars(mcu).pop, "_speeds", None)
+
+    def _reply_twice(self, mcu: FakeMcu) -> None:
+        """Send each reply with speeds twice, as a faulty repeater does."""
+        send = type(mcu)._send
+
+        def twice(at_ns: int, data: bytes) -> None:
+            send(mcu, at_ns, data)
+            if data[:2] in (b"ap", b"an"):
+                send(mcu, at_ns, data)
+
+        vars(mcu)["_send"] = twice
+        self._lasting.callback(vars(mcu).pop, "_send", None)
 
     def flip(self, place: int, mask: int, behind: int) -> None:
         """Invert bits of one character in a reply with speeds.
