@@ -45,7 +45,7 @@ from tests.simulate.roads import (
     sample,
 )
 from tests.simulate.spread import Spread
-from tests.simulate.wheels import Impossible, Wheels
+from tests.simulate.wheels import Wheels
 
 REPLAYED = 10
 """One plan in so many is recorded and replayed."""
@@ -112,7 +112,6 @@ class Run:
         self._asked_ns: int | None = None  # the daemon asked the board for its name
         self.half_duplex = HalfDuplex()
         self.followed, self.course = Followed(self.witness), Course(self.witness)
-        self.impossible = Impossible(self.witness)
         self.wheels = Wheels(self.witness, lambda: self.product.state())
         self.causes = Causes()
         self.counts: Counter[str] = self.witness.counts
@@ -424,8 +423,7 @@ class Run:
         """Check that a clear without numbers works as soon as all causes have been shown."""
         held = bool(kinds(self.plan)) or self.witness.mode not in ("fault", "stopped")
         if not held and self.causes.is_shown(asked_ns):
-            name = "a clear works two seconds behind the newest cause"
-            raise BrokenError(name, asked_ns, text)
+            raise BrokenError("a clear works two seconds behind the newest cause", asked_ns, text)
 
     # the board and the host
 
@@ -701,8 +699,6 @@ class Run:
         if not end or not any(line[:2] in (b"ap", b"an") for line in lines.split(b"\n")):
             return  # The line has no end, or begins with noise, or the board greets.
         true_ns = at_ns - START_NS + self.slept_ns
-        others = bool(set(self._names) - NO_TROUBLE - {"bias"}) or self._flipped > 0
-        self.impossible.fed(lines, others)
         gap_ns = true_ns - self._fed_ns
         if self._flipped:
             self._flipped -= 1
@@ -801,7 +797,6 @@ class Run:
             witness.disarmed_ns = max(witness.disarmed_ns, true_ns)
             self.followed.forget()
             self.liveness.event()
-        self.impossible.step(true_ns, snapshot.mode)
         self.followed.step(
             true_ns, snapshot.decided_ns, snapshot.followed_ns, snapshot.mode, snapshot.link
         )

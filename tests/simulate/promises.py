@@ -22,8 +22,6 @@ from tests.simulate.jerk import STEP, Slope
 from tests.simulate.roads import NS, Message, Sample
 
 LINE = re.compile(rb"a([pn]\d\d\.\d\d),b([pn]\d\d\.\d\d),c([pn]\d\d\.\d\d),d([pn]\d\d\.\d\d)")
-SPEED = rb"[pn](\d\d?\.\d\d)"
-"""The speed of a motor in a line of the board, behind the letter of the motor."""
 
 ZERO = (0.0, 0.0, 0.0, 0.0)
 RESTING = {*get_args(WaitCode), "no_command"} - {"nothing", "command", "senders"}

@@ -3,14 +3,12 @@
 The judge knows the true speed of each wheel. A wheel that turns against its command, or on after a
 stop, must be a latched fault before it has rolled 1 rad and 3 encoder counts. Before that, the
 command must have been constant for three response times. A robot that drives 20 % faster than any
-command of that time must be stopped, too, and one with motors swapped between its sides in its
-first turn. `state` must name a wheel that does not turn.
+command of that time must be stopped, too. `state` must name a wheel that does not turn.
 """
 
 from __future__ import annotations
 
 import math
-import re
 from collections.abc import Callable
 from typing import Any, get_args
 
@@ -39,53 +37,8 @@ TURNS = 0.05
 TOO_FAST, FAST_NS = 1.25, 3 * NS // 2
 """Share of the fastest command, and the time, after which a robot is certainly too fast."""
 
-
 NAMED_S = 1.5
 """Within this time more, `state` names the wheel: a coarse encoder is smoothed over a second."""
-
-TURN_RAD, DIFFER = math.radians(45.0), 0.3
-"""Commanded turn, with room, in which swapped motors are found, and the share by which the commands
-of the sides certainly differ."""
-
-
-SPEED = re.compile(rb"[abcd] ?[pn](\d+\.\d\d)")
-
-IMPOSSIBLE, IMPOSSIBLE_LINES = 1.02, 6
-"""Share of `feedback.wheel_speed` above which, with `COUNT_SPEED`, no wheel turns, and number of
-such lines in a row that are surely a fault. The product needs three."""
-
-COUNT_SPEED = 8.0
-"""rad/s. One count of an encoder of 400 in 5 ms looks slower."""
-
-
-class Impossible:
-    """The promise that speeds which no wheel can have are a fault."""
-
-    def __init__(self, witness: Witness) -> None:
-        config = witness.config
-        bound = config.get("feedback", {}).get("wheel_speed", 80.0)
-        coarse = config.get("sim", {}).get("encoder_counts", 3200) < 400
-        self._bound = math.inf if coarse else IMPOSSIBLE * bound + COUNT_SPEED
-        self._witness = witness
-        self._lines = 0
-
-    def fed(self, lines: bytes, others: bool) -> None:
-        """Note whole lines of the board; `others` says that it has another fault than a bias."""
-        if others:
-            self._lines = 0
-            return
-        for line in lines.split(b"\n"):
-            speeds = [float(speed) for speed in SPEED.findall(line)]
-            if len(speeds) == 4:
-                self._lines = self._lines + 1 if max(speeds) > self._bound else 0
-
-    def step(self, at_ns: int, mode: str) -> None:
-        """Judge the mode of a step, which has read these lines."""
-        if mode in ("fault", "shutdown") or not self._witness.linked:
-            self._lines = 0
-        elif self._lines > IMPOSSIBLE_LINES:
-            text = f"{self._lines} lines with more than {self._bound:.0f} rad/s"
-            raise BrokenError("impossible speeds are a fault", at_ns, text)
 
 
 class Wheels:
@@ -112,13 +65,10 @@ class Wheels:
         self._recent: list[tuple[int, float]] = []
         """Times and the fastest commands of the last three response times, rad/s."""
         self._fast_ns: int | None = None
-        self._turned = self._apart = 0.0
-        """Commanded turn and difference of the sides with swapped motors, rad."""
 
     def _forget(self, at_ns: int) -> None:
         self._since_ns, self._rolled, self._fast_ns = [at_ns] * 4, [0.0] * 4, None
         self._missed = [0.0] * 4
-        self._turned = self._apart = 0.0
 
     def see(
         self, at_ns: int, speeds: list[float], causes: frozenset[str], lies: set[str], calm_ns: int
@@ -163,8 +113,6 @@ class Wheels:
                 text += f", and has rolled {self._rolled[place]:.2f} rad"
                 raise BrokenError("a wheel that does not obey is found", at_ns, text)
         self._too_fast(at_ns, min(map(abs, speeds)))
-        if self._is_swapped():
-            self._swapped(at_ns, passed_ns / NS, commands[0], commands[1])
 
     def _named(self, at_ns: int, place: int, seconds: float, speed: float) -> None:
         """Check that `state` names a wheel that does not turn, or seems not to."""
@@ -210,26 +158,3 @@ class Wheels:
         if at_ns - self._fast_ns > FAST_NS + self._response_ns and rolled > coarse:
             text = f"all wheels turn at {slowest:.2f} rad/s, commanded were {fastest:.2f} rad/s"
             raise BrokenError("a robot that is too fast is stopped", at_ns, text)
-
-    def _is_swapped(self) -> bool:
-        """Return whether two motors of different sides are swapped, and nothing else."""
-        lies, motors = self._witness.lies, self._witness.motors
-        if len(lies) != 1 or lies[0][0] != "swapped_motors":
-            return False
-        sides = [next(w for w, (m, _) in enumerate(motors) if m == v) in (0, 3) for v in lies[0][1]]
-        return sides[0] is not sides[1]
-
-    def _swapped(self, at_ns: int, seconds: float, right: float, left: float) -> None:
-        """Check that motors that are swapped between the sides are found in the first turn."""
-        _, turn = self._witness.twist((right, left, left, right))
-        if abs(right - left) < DIFFER * max(abs(right), abs(left), 0.1):
-            return
-        self._turned += abs(turn) * seconds
-        self._apart += abs(right - left) / 2 * seconds
-        late_s = (self._response_ns + 2 * ROOM_NS) / NS
-        turned = TURN_RAD + abs(turn) * late_s
-        apart = self._roll + ROOM_RAD + abs(right - left) / 2 * late_s
-        self._witness.counts["wheels swapped"] += 1
-        if self._turned > turned and self._apart > apart:
-            text = f"the commanded turns are {math.degrees(self._turned):.0f} deg"
-            raise BrokenError("swapped motors are found in the first turn", at_ns, text)
