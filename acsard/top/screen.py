@@ -40,8 +40,8 @@ MODE_STYLES = {
 
 LINK_STYLES = {"up": "bold green", "booting": "bold yellow"}
 
-# Cells of the tables on the left and on the right.
-PAIR_WIDTHS = 38, 40
+# Cells of the tables on the left, with the gap, and on the right.
+PAIR_WIDTHS = 40, 40
 
 # Of the lines that a hostile message could make.
 MAX_SOURCES, MAX_REASONS = 32, 16
@@ -84,10 +84,10 @@ def screen(data: ScreenData, width: int) -> Group:
 
 def _in_pairs(parts: Sequence[Table], width: int) -> Sequence[Table]:
     # Below each other on a narrow terminal.
-    if width < sum(PAIR_WIDTHS) + 2:
+    if width < sum(PAIR_WIDTHS):
         return parts
     # `rich.columns` would find the widths by itself, but takes twice as long.
-    grid = Table.grid(padding=(0, 2, 0, 0))
+    grid = Table.grid(padding=0)  # versions of rich differ in what a width includes
     for column_width in PAIR_WIDTHS:
         grid.add_column(width=column_width)
     for left, right in zip(parts[::2], parts[1::2], strict=True):
