@@ -6,7 +6,7 @@ import math
 from itertools import pairwise
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from acsard.core.values import NS_PER_S, Measured, Spread
@@ -45,6 +45,7 @@ def test_an_empty_histogram_has_only_zeros() -> None:
     assert Histogram().spread() == Spread(0, 0.0, 0.0, 0.0)
 
 
+@settings(max_examples=100)
 @given(st.lists(st.integers(US, US * 10**DECADES), min_size=1, max_size=300))
 def test_a_percentile_is_at_most_one_bucket_above_the_truth(durations_ns: list[int]) -> None:
     spread = spread_of(durations_ns)
@@ -53,25 +54,13 @@ def test_a_percentile_is_at_most_one_bucket_above_the_truth(durations_ns: list[i
         assert truth * (1 - 1e-9) <= percentile <= truth * BUCKET * (1 + 1e-9)
 
 
+@settings(max_examples=100)
 @given(st.lists(st.integers(-(10**6), 10**15), min_size=1, max_size=100))
 def test_count_and_maximum_are_exact_and_the_percentiles_in_order(durations_ns: list[int]) -> None:
     spread = spread_of(durations_ns)
     assert spread.count == len(durations_ns)
     assert spread.max == max(0, *durations_ns) / US
     assert 0.0 <= spread.p50 <= spread.p99 <= spread.max
-
-
-def test_one_outlier_in_two_hundred_shows_in_the_maximum_only() -> None:
-    spread = spread_of([10 * US] * 199 + [5000 * US])
-    assert spread.p50 == pytest.approx(10.0, rel=0.13)
-    assert spread.p99 == pytest.approx(10.0, rel=0.13)
-    assert spread.max == 5000.0
-
-
-def test_two_outliers_in_a_hundred_show_in_the_99th_percentile() -> None:
-    spread = spread_of([10 * US] * 98 + [5000 * US] * 2)
-    assert spread.p50 == pytest.approx(10.0, rel=0.13)
-    assert spread.p99 == pytest.approx(5000.0, rel=0.13)
 
 
 def test_measurements_beyond_the_decades_are_counted_in_the_end_buckets() -> None:
@@ -91,13 +80,6 @@ def test_every_figure_is_reported_from_the_start() -> None:
     assert Stopwatch().measured(0) == dict.fromkeys(NAMES, Measured(Spread(), Spread()))
 
 
-def test_a_new_measurement_counts_since_the_start_and_in_the_last_minute() -> None:
-    stopwatch = Stopwatch()
-    stopwatch.figures["step_time"].add(250 * US)
-    figure = step_time(stopwatch, NS_PER_S)
-    assert figure.since_start == figure.last_minute == Spread(1, 250.0, 250.0, 250.0)
-
-
 def test_a_measurement_older_than_a_minute_counts_only_since_the_start() -> None:
     stopwatch = Stopwatch()
     stopwatch.figures["step_time"].add(250 * US)
@@ -105,17 +87,6 @@ def test_a_measurement_older_than_a_minute_counts_only_since_the_start() -> None
     assert step_time(stopwatch, MINUTE_NS - 1).last_minute.count == 1
     figure = step_time(stopwatch, MINUTE_NS + NS_PER_S)
     assert (figure.since_start.count, figure.last_minute.count) == (1, 0)
-
-
-def test_after_a_pause_of_any_length_the_last_minute_has_no_old_measurements() -> None:
-    for pause in range(1, 3 * SLOTS):
-        stopwatch = Stopwatch()
-        for slot in range(SLOTS):
-            stopwatch.figures["step_time"].add(100 * US)
-            stopwatch.figures["step_time"].sort(slot * SLOT_NS)
-        now_ns = (SLOTS - 1 + pause) * SLOT_NS
-        left = max(0, SLOTS - pause)
-        assert step_time(stopwatch, now_ns).last_minute.count == left
 
 
 def test_reported_figures_are_at_most_a_second_old() -> None:
@@ -127,6 +98,7 @@ def test_reported_figures_are_at_most_a_second_old() -> None:
     assert step_time(stopwatch, NS_PER_S).since_start.count == 2
 
 
+@settings(max_examples=40)
 @given(st.lists(st.tuples(st.integers(0, 20 * NS_PER_S), st.integers(0, 10**9)), max_size=60))
 def test_the_last_minute_equals_a_histogram_of_its_measurements(
     measurements: list[tuple[int, int]],
