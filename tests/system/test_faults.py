@@ -6,7 +6,6 @@ tests run with `pytest -m soak -s tests/system/test_faults.py`, which prints the
 
 from __future__ import annotations
 
-import fcntl
 import itertools
 import os
 import pty
@@ -34,15 +33,11 @@ from tests.system.harness import (
     Periods,
     Program,
     ReceivedLine,
-    alive_at,
     broken,
-    environment,
-    free_endpoint,
     kept_waiting,
     seconds,
     twist,
     until,
-    wheels,
 )
 from tests.system.strangers import BUSY, COMMANDER, command_line
 
@@ -228,82 +223,6 @@ def test_when_a_commander_is_killed_the_ramp_starts_within_its_timeout_and_a_tic
     ramps = killed_commanders(*far, count)
     assert max(ramp.step for ramp in ramps) <= TIMEOUT_S + TICK_S + LATE_S
     assert max(ramp.line for ramp in ramps) <= TIMEOUT_S + TICK_S + SLACK_S
-
-
-TWO = [
-    {"name": "first", "priority": 50, "timeout": 0.25},
-    {"name": "second", "priority": 50, "timeout": 0.25},
-    {"name": "third", "priority": 10, "timeout": 0.25},
-]
-
-
-@contextmanager
-def three_sources(where: Path, peer: FarPeer) -> Iterator[Daemon]:
-    """A daemon with three sources: two of the same priority, and one with a lower priority."""
-    rows = "".join(
-        f'[[commands.sources]]\nname = "{row["name"]}"\npriority = {row["priority"]}\n'
-        f"timeout = {row['timeout']}\n"
-        for row in TWO
-    )
-    config, endpoint = where / "sources.toml", free_endpoint()
-    config.write_text(
-        f'[mcu]\nport = "{peer.path}"\n[bus]\nlisten = ["{endpoint}"]\n{rows}',
-    )
-    with Daemon(where, words=["--config", str(config)], endpoint=endpoint) as daemon:
-        yield daemon
-
-
-def taken_over(
-    peer: FarPeer, daemon: Daemon, bus: Bus, successor: str
-) -> tuple[float, list[ReceivedLine]] | None:
-    """Kill a commander while another one waits.
-
-    Returns the time of its last command, and the lines from then until the other one's speed.
-    Returns None if the machine interrupted the link meanwhile.
-    """
-    with bus.follow("state") as states, commander(daemon, 0.3, "first") as first:
-        steady = drives(peer, first).at
-        with commander(daemon, 0.1, successor) as other:
-            until(lambda: len(other.out) > 5, 5.0, "the other one commands")
-
-            def waiting() -> str:
-                return next(
-                    str(s["waits_for"]) for s in bus.state()["sources"] if s["name"] == successor
-                )
-
-            until(lambda: waiting().startswith("first has "), 5.0, "only the first one counts")
-            driven = peer.lines[-1].line.startswith(text(0.3))
-            first.signal(signal.SIGKILL)
-            first.ended(5.0)
-            sent = last_put(first)
-            reached = peer.awaits(text(0.1), after=sent)
-            source = bus.state()["source"]
-        until(lambda: peer.lines[-1].line == ZERO_TEXT, 5.0, "at rest")
-        if broken(states, steady):
-            return None
-    assert driven
-    assert source == successor
-    return sent, peer.since(sent, reached.at)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("successor", ["second", pytest.param("third", marks=pytest.mark.slow)])
-def test_when_a_commander_is_killed_the_next_one_takes_over_from_its_own_command(
-    tmp_path: Path, successor: str
-) -> None:
-    with (
-        FarPeer(tmp_path) as peer,
-        three_sources(tmp_path, peer) as daemon,
-        Bus(daemon.endpoint) as bus,
-    ):
-        took = until(lambda: taken_over(peer, daemon, bus, successor), 30.0, "with the link up")
-    sent, later = took
-    slower = next(h for h in later if not h.line.startswith(text(0.3)))
-    ramp = [wheels(entry.line)[0] for entry in later]
-    print(f"{successor} takes over {slower.at - sent:.3f} s after the last command")
-    assert slower.at - sent <= TIMEOUT_S + TICK_S + SLACK_S + lost(sent, slower.at)
-    assert ramp == sorted(ramp, reverse=True)
-    assert ramp[-1] == 2.0, "it never fell below what the successor asks for"
 
 
 # the cable
@@ -629,34 +548,6 @@ def test_after_half_a_second_s_stall_no_speed_is_resumed_for_a_commander_that_ha
 
 
 @pytest.mark.slow
-def test_after_half_a_second_s_stall_a_commander_that_goes_on_drives_from_zero_by_the_ramp(
-    far: tuple[FarPeer, Daemon],
-) -> None:
-    peer, daemon = far
-    with (
-        Bus(daemon.endpoint) as bus,
-        bus.follow("state") as states,
-        commander(daemon, 0.3) as driver,
-    ):
-        drives(peer, driver)
-        with stalled(daemon):
-            begun = time.monotonic()
-            until(lambda: time.monotonic() > begun + 0.5, 5.0, "half a second")
-            woken = time.monotonic()
-        steady = peer.awaits(text(0.3), after=woken)
-        after = peer.since(woken, steady.at)
-        assert no_burst(after) >= 0.0
-        assert after[0].line == ZERO_TEXT
-        ramp = [wheels(entry.line)[0] for entry in after]
-        assert max(b - a for a, b in itertools.pairwise(ramp)) <= 20 * 0.05 + 0.01
-        # The machine may keep the commander or the link waiting as well, which causes another ramp.
-        puts = [woken, *(at for at in puts_of(driver) if at > woken), steady.at]
-        silent = max(b - a for a, b in itertools.pairwise(puts))
-        if silent < TIMEOUT_S - TICK_S and not broken(states, woken, steady.at):
-            assert ramp == sorted(ramp)
-
-
-@pytest.mark.slow
 def test_after_a_stall_of_seconds_a_commander_that_goes_on_must_be_neutral_first(
     far: tuple[FarPeer, Daemon],
 ) -> None:
@@ -701,42 +592,3 @@ def test_after_50_stalls_of_any_length_the_first_line_is_zero_and_none_comes_in_
 
 
 # output that blocks
-
-
-@contextmanager
-def full_pipe() -> Iterator[int]:
-    """Provide a full pipe that no process reads, so that every write to it blocks for ever."""
-    reader, writer = os.pipe()
-    fcntl.fcntl(writer, fcntl.F_SETPIPE_SZ, 4096)
-    os.set_blocking(writer, False)
-    try:
-        while True:
-            os.write(writer, b".")
-    except BlockingIOError:
-        os.set_blocking(writer, True)
-    try:
-        yield writer
-    finally:
-        os.close(reader)
-        os.close(writer)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("which", [pytest.param("stdout", marks=pytest.mark.slow), "stderr"])
-def test_control_goes_on_and_ends_well_when_output_is_blocked_for_the_whole_run(
-    tmp_path: Path, peer: Peer, which: str
-) -> None:
-    with ExitStack() as stack:
-        how: dict[str, Any] = {which: stack.enter_context(full_pipe())}
-        # Run it as a user starts it, with buffered streams.
-        how["env"] = {k: v for k, v in environment().items() if k != "PYTHONUNBUFFERED"}
-        daemon = stack.enter_context(Daemon(tmp_path, peer.path, ready=False, **how))
-        with alive_at(daemon.endpoint, daemon) as alive:
-            until(alive.try_recv, 5.0, "the alive token")
-        until(lambda: ZERO_LINE in peer.session.raw_lines(), 5.0, "the first line on the wire")
-        with Bus(daemon.endpoint) as bus:
-            with bus.commanding(0.5):
-                until(lambda: peer.lines[-1].line.startswith(text(0.5)), 5.0, "steady driving")
-            daemon.signal(signal.SIGTERM)
-            assert daemon.ended(5.0) == 0
-        assert peer.last_line() == ZERO_LINE

@@ -14,20 +14,15 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from signal import SIGTERM
 from typing import Any, NamedTuple
-from urllib.error import HTTPError
-from urllib.request import Request, urlopen
+from urllib.request import urlopen
 
 import pytest
 import zstandard
-from websockets.sync.client import connect
-from websockets.typing import Subprotocol
 
 from acsard.core.messages import schema
 from acsard.core.messages.keys_and_roles import PUBLISHED, SERVICES
 from acsard.core.messages.schema import Message
-from acsard.web.callers import PROTOCOL
-from tests.system.harness import Bus, Daemon, Finished, Peer, Program, finish, free_endpoint, until
-from tests.system.terminals import SCREEN, at_terminal
+from tests.system.harness import Bus, Daemon, Finished, Peer, finish, until
 from tests.system.versions import (
     CODE,
     LATCH_CODE,
@@ -246,102 +241,6 @@ def test_each_method_of_the_python_client_works_with_the_other_version(pair: Pai
     success, text = done["strict"]
     assert success is False
     assert "unknown field `zaw`" in text
-
-
-def test_the_keyboard_drives_a_robot_of_the_other_version(pair: Pair) -> None:
-    how = f"""\
-import fcntl, os, sys, termios
-del os.environ["PYTHONPATH"]
-fcntl.ioctl(0, termios.TIOCSCTTY, 0)
-os.execv({pair.client.acsard!r}, ["acsard", *sys.argv[1:]])
-"""
-    words = ("drive", "--config", str(pair.daemon.config))
-    with (
-        Bus(pair.daemon.endpoint) as bus,
-        at_terminal(pair.where, *words, how=how, term=SCREEN) as (at, tool),
-    ):
-
-        def drives() -> bool | None:
-            at.press("i")
-            return bus.state()["mode"] == "driving" or None
-
-        until(drives, 15, f"the robot drives\n{at.screen}")
-        at.press("\x03")
-        assert tool.ended(10) == 0, at.screen
-
-
-def test_a_guided_calibration_begins_with_the_other_version(pair: Pair) -> None:
-    words = [
-        "calibrate",
-        "drive",
-        "--poses",
-        "sim/pose",
-        "--yes",
-        "--config",
-        str(pair.daemon.config),
-    ]
-    program = [pair.client.acsard, *words]
-    with (
-        Bus(pair.daemon.endpoint) as bus,
-        Program(program, pair.where, plain_environment()) as tool,
-    ):
-        until(
-            lambda: tool.process.poll() is not None or bus.state()["mode"] == "driving" or None,
-            20,
-            "it drives",
-        )
-        assert tool.process.poll() is None, tool
-
-
-def test_foxglove_shows_a_robot_of_the_other_version(pair: Pair) -> None:
-    port = free_endpoint().rpartition(":")[2]
-    words = ["foxglove", "--address", f"127.0.0.1:{port}", "--config", str(pair.daemon.config)]
-    with Program([pair.client.acsard, *words], pair.where, plain_environment()) as tool:
-        tool.says("connect Foxglove")
-        with connect(
-            f"ws://127.0.0.1:{port}", subprotocols=[Subprotocol("foxglove.sdk.v1")]
-        ) as socket:
-            seen = ""
-            while "/state" not in seen:
-                seen += str(socket.recv(timeout=10))
-
-
-def test_the_page_shows_stops_and_calls_a_robot_of_the_other_version(pair: Pair) -> None:
-    port = free_endpoint().rpartition(":")[2]
-    address = f"http://127.0.0.1:{port}"
-    words = ["web", "--address", address, "--config", str(pair.daemon.config)]
-    env = plain_environment(XDG_STATE_HOME=str(pair.where))
-
-    def posted(verb: str, **fields: object) -> dict[str, Any]:
-        body = json.dumps(fields).encode()
-        head = {"Content-Type": "application/json"}
-        request = Request(f"{address}/api/srv/{verb}", body, head, method="POST")
-        try:
-            with urlopen(request, timeout=10) as answer:
-                return dict(json.load(answer))
-        except HTTPError as error:
-            return dict(json.load(error))
-
-    with Program([pair.client.acsard, *words], pair.where, env) as tool:
-        tool.says(address)
-        with connect(f"ws://127.0.0.1:{port}/ws", subprotocols=[Subprotocol(PROTOCOL)]) as socket:
-            heard: dict[str, Any] = {}
-            socket.send('{"subscribe": "state"}')
-            while not heard.get("value"):
-                heard |= json.loads(socket.recv(timeout=10))
-            assert heard["hello"]["robot"] == "acsar"
-            assert ("later" in heard["value"]) is pair.is_client_older
-            with urlopen(f"{address}/api/settings", timeout=10) as answer:
-                assert any(row["key"] == "limits.linear_speed" for row in json.load(answer))
-            with urlopen(f"{address}/metrics", timeout=10) as answer:
-                assert b"acsard" in answer.read()
-            assert posted("stop")["success"] is True
-            causes = until(lambda: state_of(address)["causes"] or None, 5, "it is stopped")
-            numbers = [cause["number"] for cause in causes]
-            assert posted("clear", numbers=numbers)["success"] is True
-            for answer in (posted(VERB), called(socket, VERB)):
-                text = answer.get("message") or answer.get("text")
-                assert text == "dances" or "is not a service of this robot" in str(text), answer
 
 
 def state_of(address: str) -> dict[str, Any]:
