@@ -114,7 +114,7 @@ class Access:
 
     @web.middleware
     async def _serve(self, request: web.Request, handler: Handler) -> web.StreamResponse:
-        with connection_of(request).serving():
+        with connection_of(request).serving(request.content):
             answer = await self._answer(request, handler)
         if request.get(LAST_KEY):
             answer.force_close()

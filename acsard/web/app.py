@@ -175,7 +175,7 @@ class Page:
         await served.prepare(request)
         _limit_buffer(request)
         viewer = Viewer(served, request, identity, self._parts, camera=self._has_camera)
-        connection_of(request).end = viewer.end
+        connection_of(request).become_socket(viewer.end)
         self._viewers.add(viewer)
         try:
             await viewer.run()

@@ -16,7 +16,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Never, Protocol
 
-from aiohttp import web
+from aiohttp import StreamReader, web
 
 from acsard.host.rate_limits import Places
 from acsard.web.answers import HEADERS, cut, problem, unsent_bytes
@@ -35,6 +35,10 @@ HANDSHAKE_S, IDLE_S, UNREAD_S = 3.0, 8.0, 5.0
 
 # Read buffer of a connection, and the answers that may wait for a client that reads slowly.
 READ_BYTES, WRITE_BYTES = 16384, 65536
+
+# Requests behind the present one: more than any client sends that waits for its answers. aiohttp
+# would keep 32 requests, whose heads take 0.5 MB each.
+MAX_WAITING_BYTES = 131072
 
 # Of a request. A browser sends the cookies for all ports of a host in one header, so less could
 # lock it out.
@@ -189,7 +193,9 @@ class HttpConnection(web.RequestHandler):
         # Ends the connection for a reason, which a WebSocket sends to its client.
         self.end: Callable[[str], None] = lambda why: self.cut()
         self._connections = connections
-        self._serves = False
+        self._serves, self._is_socket = False, False
+        self._body: StreamReader | None = None
+        self._waiting_bytes = 0
 
     @property
     def is_busy(self) -> bool:
@@ -197,13 +203,17 @@ class HttpConnection(web.RequestHandler):
         return self._serves or unsent_bytes(self.transport) > 0
 
     @contextmanager
-    def serving(self) -> Iterator[None]:
+    def serving(self, body: StreamReader) -> Iterator[None]:
         """Serve a request during a `with` block."""
-        self._serves = True
+        self._serves, self._body, self._waiting_bytes = True, body, 0
         try:
             yield
         finally:
             self._serves = False
+
+    def become_socket(self, end: Callable[[str], None]) -> None:
+        """Note that a WebSocket is open, which `end` closes with a reason."""
+        self.end, self._is_socket = end, True
 
     def cut(self) -> None:
         cut(self.transport)
@@ -212,6 +222,17 @@ class HttpConnection(web.RequestHandler):
         assert isinstance(transport, asyncio.Transport)
         transport.set_write_buffer_limits(WRITE_BYTES)
         super().connection_made(transport)
+
+    def data_received(self, data: bytes) -> None:
+        # aiohttp limits how much of a body and of a WebSocket it keeps.
+        in_body = self._body is not None and not self._body.is_eof()
+        if not (in_body or self._is_socket):
+            self._waiting_bytes += len(data)
+        if self._waiting_bytes > MAX_WAITING_BYTES:
+            self._connections.counts.refuse("crowded", self.peer)
+            self.cut()
+        else:
+            super().data_received(data)
 
     def connection_lost(self, exc: BaseException | None) -> None:
         super().connection_lost(exc)

@@ -24,6 +24,7 @@ from acsard.web.connections import (
     MAX_LOCAL,
     MAX_OF_NETWORK,
     MAX_OF_TOKEN,
+    MAX_WAITING_BYTES,
     UNREAD_S,
     Connections,
     HttpConnection,
@@ -74,6 +75,9 @@ async def test_a_connection_beyond_the_limit_is_closed_and_the_next_has_the_plac
             writer.close()
 
 
+NO_BODY = Mock(is_eof=lambda: True)
+
+
 class Owned:
     """The connections of one token."""
 
@@ -96,7 +100,7 @@ class Owned:
 async def test_a_token_with_all_its_connections_loses_an_idle_one_to_a_new_one() -> None:
     """The idle connections of a phone that has changed its network must not lock it out."""
     owned = Owned(MAX_OF_TOKEN)
-    with owned.made[0].serving():
+    with owned.made[0].serving(NO_BODY):
         newcomer = owned.new()
         assert owned.all.claim(newcomer, "phone")
         assert owned.all.claim(newcomer, "phone")  # its next request
@@ -107,7 +111,7 @@ async def test_a_token_whose_connections_are_all_busy_gets_no_further_one() -> N
     owned = Owned(MAX_OF_TOKEN)
     with ExitStack() as stack:
         for connection in owned.made:
-            stack.enter_context(connection.serving())
+            stack.enter_context(connection.serving(NO_BODY))
         assert not owned.all.claim(owned.new(), "phone")
         assert owned.all.claim(owned.new(), "tv")  # another token has its own
     assert owned.aborted() == []
@@ -125,11 +129,29 @@ async def test_a_tls_connection_that_was_closed_twice_gives_its_place_to_a_new_o
 
 async def test_all_connections_of_a_token_end_and_a_socket_gets_the_reason() -> None:
     owned, reasons = Owned(3), list[str]()
-    owned.made[1].end = reasons.append
+    owned.made[1].become_socket(reasons.append)
     owned.all.end("tv", "too fast")
     owned.all.end("phone", "too fast", but=owned.made[2])
     assert owned.aborted() == [owned.made[0]]
     assert reasons == ["too fast"]
+
+
+@pytest.mark.parametrize("more", ["", "X-0: " + "x" * 8000 + "\r\n"])
+async def test_requests_behind_the_present_one_are_bounded(more: str) -> None:
+    """Without a limit, each stranger who reads no answers costs 14 MB by 32 requests of 0.2 MB."""
+    owned = Owned(1)
+    (connection,) = owned.made
+    request = f"GET / HTTP/1.1\r\nHost: r\r\n{more}\r\n".encode()
+    with connection.serving(NO_BODY):
+        for _ in range(MAX_WAITING_BYTES // len(request)):
+            connection.data_received(request)
+        assert owned.aborted() == []
+        connection.data_received(request)
+        assert owned.aborted() == [connection]
+    connection.transport = Mock()
+    with connection.serving(Mock(is_eof=lambda: False)):  # a body
+        connection.data_received(b"")
+    assert owned.aborted() == []
 
 
 def test_the_manual_states_the_limits() -> None:
