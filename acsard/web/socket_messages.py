@@ -21,7 +21,7 @@ from acsard.core.values import AcsardError, Role
 # At which the values of a key are sent: the maximum, and the default.
 MAX_RATE, USUAL_RATE = 50.0, 10.0
 
-# Some hours before the largest stamp that the daemon accepts, because the zero for a client that
+# Months before the largest stamp that the daemon accepts, because the zero for a client that
 # disconnects has a later stamp than its last command.
 MAX_STAMP_MS = 9.2e12
 

@@ -54,8 +54,8 @@ class _File(Struct, frozen=True):
 class Vault:
     """The access tokens of one robot. The token file also contains tokens of other robots.
 
-    The clock of a robot without a battery may begin in 1970 at each start. An expired token stays
-    expired, because the server deletes it.
+    The clock of a robot without a battery may begin in 1970 at each start. A token that expired
+    while the server ran stays expired, because the server deleted it.
     """
 
     def __init__(self, directory: Path, robot: str) -> None:
