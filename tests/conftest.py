@@ -69,9 +69,10 @@ A second is the aim: of 5,400 such tests 20 took 1.0 to 2.7 s on a machine with 
 MARKS = {"slow", "soak", "bench", "network", "systemd", "firmware", "languages", "bridge"}
 
 LOUD = (
-    "test_board.py", "test_bus.py", "test_daemon.py", "test_faults.py", "test_faults_bus.py",
-    "test_inputs.py", "test_isolation.py", "test_page_attacks.py", "test_page_lets_go.py",
-    "test_page_program_lets_go.py", "test_period.py", "test_record_disks.py", "test_strangers.py",
+    "test_board.py", "test_bus.py", "test_daemon.py", "test_link_faults.py", "test_bus_faults.py",
+    "test_inputs.py", "test_access_isolation.py", "test_page_attacks.py", "test_page_lets_go.py",
+    "test_page_program_lets_go.py", "test_lateness_period.py", "test_recording_disks.py",
+    "test_access_strangers.py",
 )  # fmt: skip
 """Live modules that load the machine, or that count missed periods.
 

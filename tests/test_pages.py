@@ -124,7 +124,7 @@ def test_settings_for_zenoh_are_accepted(block: Block) -> None:
 
 
 def test_the_subscribers_of_other_languages_in_the_readme_are_those_that_are_run() -> None:
-    """`tests/system/test_languages.py` runs these blocks with another key."""
+    """`tests/system/test_client_languages.py` runs these blocks with another key."""
     calls = re.findall(r"`(session\.declare\w+\([^`]+)`", prose("README.md"))
     sources = [
         text_of(f"deploy/clients/{file}")

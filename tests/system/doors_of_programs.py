@@ -55,7 +55,7 @@ class OfClient(Door):
 
     zeroes = True
     lacks: ClassVar = {
-        "late": "it echoes the newest beat: `test_echo.py` delays it in a queue",
+        "late": "it echoes the newest beat: `test_lateness_echo.py` delays it in a queue",
         "bad": "its arguments are checked before it sends",
     }
 

@@ -450,7 +450,7 @@ def test_queries_beyond_the_limit_are_answered_or_refused_with_ask_again(bus: Bu
 def test_a_stop_query_after_more_queries_than_the_limit_stops_the_robot(
     bus: Bus, shared: Daemon
 ) -> None:
-    # A get on every key is dozens of queries. `test_inbox.py` covers queries that are dropped
+    # A get on every key is dozens of queries. `test_bus_inbox.py` covers queries that are dropped
     # unanswered.
     unanswered = 0
     with restored(bus), Bus(shared.endpoint) as crowd, bus.follow("state") as states:

@@ -37,7 +37,7 @@ from tests.system.harness import (
 )
 from tests.system.identities import free_tls_endpoint
 from tests.system.terminals import SCREEN, at_terminal, screens
-from tests.system.test_record_disks import disk
+from tests.system.test_recording_disks import disk
 from tests.system.typed import typed
 
 pytestmark = pytest.mark.slow  # each starts two robots and a router

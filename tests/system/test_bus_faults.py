@@ -1,7 +1,7 @@
 """Faults of the bus (SAFETY section 2): partition, flood, stalls, and a router that dies.
 
 The daemon is the real one. Every promise has a short test here. The long tests run with `pytest -m
-soak -s tests/system/test_faults_bus.py`, which prints their results.
+soak -s tests/system/test_bus_faults.py`, which prints their results.
 """
 
 from __future__ import annotations

@@ -19,7 +19,7 @@ import pytest
 
 from tests.system import bystander
 from tests.system.harness import Bus, Daemon, Periods, environment, until
-from tests.system.test_record import files, replayed
+from tests.system.test_recording import files, replayed
 
 pytestmark = [
     pytest.mark.slow,

@@ -15,7 +15,7 @@ import pytest
 
 from acsard.client import connect
 from tests.system.harness import Bus, Daemon, Program, until
-from tests.system.test_faults_bus import port_of
+from tests.system.test_bus_faults import port_of
 
 pytestmark = pytest.mark.network
 

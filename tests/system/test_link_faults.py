@@ -1,7 +1,7 @@
 """Faults of processes, the kernel and the serial line (SAFETY section 2), with the real daemon.
 
-The faults of the bus are in `test_faults_bus.py`. Every promise has a short test here. The long
-tests run with `pytest -m soak -s tests/system/test_faults.py`, which prints their results.
+The faults of the bus are in `test_bus_faults.py`. Every promise has a short test here. The long
+tests run with `pytest -m soak -s tests/system/test_link_faults.py`, which prints their results.
 """
 
 from __future__ import annotations

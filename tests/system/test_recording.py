@@ -1,6 +1,6 @@
 """The daemon process loses no recording when it is killed or ended, and drives on without a disk.
 
-It also drives on when the disk is full. `test_record_disks.py` tests real disks that fail.
+It also drives on when the disk is full. `test_recording_disks.py` tests real disks that fail.
 """
 
 from __future__ import annotations
