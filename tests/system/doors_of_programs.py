@@ -71,7 +71,7 @@ class OfClient(Door):
 
 
 class Sync(OfClient):
-    name = "Python client"
+    name, marks = "Python client", pytest.mark.slow
 
     def open(self) -> None:
         self._client = self.stack.enter_context(connect(self.robot.endpoint))
