@@ -240,14 +240,6 @@ def test_a_certificate_that_has_expired_is_a_failure(tmp_path: Path) -> None:
     assert "expired 3 days ago" in finding["text"]
 
 
-def test_certificates_that_are_missing_are_named(tmp_path: Path) -> None:
-    text = with_certificates(tmp_path, 400)
-    (tmp_path / "tls" / "ca.pem").unlink()
-    code, findings = examined(tmp_path, text)
-    assert code == 1
-    assert "ca.pem is missing" in worst(findings["certificates"])["text"]
-
-
 @pytest.mark.nightly
 def test_the_certificate_of_the_options_or_the_environment_is_looked_at(tmp_path: Path) -> None:
     text = with_certificates(tmp_path, 400)
@@ -260,27 +252,9 @@ def test_the_certificate_of_the_options_or_the_environment_is_looked_at(tmp_path
     assert [finding["level"] for finding in variable["certificates"]] == ["warning"]
 
 
-def test_a_key_that_others_may_read_is_a_failure(tmp_path: Path) -> None:
-    text = with_certificates(tmp_path, 400)
-    (tmp_path / "tls" / "key.pem").chmod(0o644)
-    code, findings = examined(tmp_path, text)
-    assert code == 1
-    assert "chmod 600" in worst(findings["certificates"])["mend"]
-
-
 def test_a_router_on_a_plain_endpoint_is_a_warning(tmp_path: Path) -> None:
     _, findings = examined(tmp_path, toml(more='connect = ["tcp/127.0.0.1:7447"]\n'))
     assert "every program that is connected to that router" in worst(findings["bus"])["text"]
-
-
-def test_the_text_output_has_a_line_for_each_finding_and_one_for_its_remedy(tmp_path: Path) -> None:
-    file = tmp_path / "doctor.toml"
-    file.write_text(toml("/dev/acsar_that_is_not"))
-    words = [sys.executable, "-m", "acsard", "doctor", "--config", str(file)]
-    done = subprocess.run(words, capture_output=True, text=True, timeout=30, check=False)
-    lines = done.stdout.splitlines()
-    index = next(i for i, line in enumerate(lines) if line.startswith("FAIL  port: "))
-    assert lines[index + 1].startswith("      -> ")
 
 
 def test_ports_lists_the_serial_ports_or_refers_to_dmesg() -> None:
