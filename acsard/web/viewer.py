@@ -89,6 +89,7 @@ class Viewer:
         self._ending: asyncio.Task[None] | None = None
         self._stop_ids: list[int | str] = []
         self._unreachable_reason, self._about = "", parts.robot.about
+        self._greeting: socket_messages.Greeting | None = None  # the last one
 
     async def run(self) -> None:
         self._greet()
@@ -238,7 +239,9 @@ class Viewer:
             self._camera,
             versions.unused(),
         )
-        self._out.enqueue(socket_messages.Hello(greeting))
+        if greeting != self._greeting:
+            self._greeting = greeting
+            self._out.enqueue(socket_messages.Hello(greeting))
 
     def _look_around(self, now: float) -> float:
         if self._robot.gone != self._unreachable_reason:

@@ -14,6 +14,7 @@ import msgspec
 import pytest
 from aiohttp import web
 from aiohttp.test_utils import make_mocked_request
+from msgspec.structs import replace
 
 from acsard.bus.address import Address
 from acsard.core.messages.schema import Beat, ServiceReply
@@ -192,6 +193,16 @@ async def test_a_flood_of_messages_leaves_each_other_client_its_turn() -> None:
         await page.viewer.run()
     other.cancel()
     assert turns > 900
+
+
+async def test_the_greeting_is_sent_again_only_after_a_change() -> None:
+    page = Page("viewer")
+    robot, out = page.viewer._robot, page.viewer._out._out
+    page.viewer._greet()
+    for linear, sent in ((1.0, 1), (0.5, 2), (0.5, 2)):
+        robot.about = replace(robot.about, linear=linear)  # of the query every ten seconds
+        page.viewer._look_around(0.0)
+        assert len([text for text, _ in out if b"hello" in text]) == sent
 
 
 async def test_every_press_is_answered_by_a_stop_that_was_sent_after_it() -> None:
