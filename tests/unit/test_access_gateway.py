@@ -1,7 +1,4 @@
-"""Tests of how the gateway judges the incidents of its own Zenoh session.
-
-It logs them, and it restarts if necessary.
-"""
+"""The health of the TLS gateway's sessions."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""Tests of the outlets, through which the control loop publishes on the bus.
-
-The loop never waits, and an outlet sends only the newest value.
-"""
+"""What the daemon puts on the bus, and the routers to which it is linked."""
 
 from __future__ import annotations
 
@@ -28,7 +25,9 @@ from acsard.daemon.bus.outlets import (
     SLOW_PUT_NS,
     Outlets,
 )
+from acsard.daemon.bus.router_links import unreached
 from acsard.host import clock
+from tests.each import each
 
 TOPIC, KEY = "cmd_vel_out", "acsard/acsar/cmd_vel_out"
 WAIT_S = 5.0
@@ -303,3 +302,35 @@ def test_a_beat_is_sent_by_the_control_loop_itself_unless_a_put_was_slow(
         wait_until(lambda: outlets._began_ns is None)
     outlets.stop(WAIT_S)
     assert sent == [(Beat(7, 0), True), (Beat(7, 1), True), (Beat(7, 2), False), (Beat(7, 3), True)]
+
+
+A, B = "tcp/127.0.0.1:7447", "tcp/127.0.0.1:7450"
+
+
+@each(
+    ("mode", "endpoints", "ends", "missing"),
+    [
+        ("peer", (A,), {A}, ()),
+        ("peer", (A,), set(), (A,)),
+        # the TLS gateway or a ROS node connected to this process
+        ("peer", (A,), {"tcp/127.0.0.1:50123"}, (A,)),
+        ("peer", (A, B), {A}, (B,)),
+        ("peer", (A, B), {A, B}, ()),
+        ("peer", ("tcp/localhost:7447",), {A}, ()),
+        ("peer", ("tcp/localhost:7447", B), {B}, ("tcp/localhost:7447",)),
+        ("peer", ("tcp/nobody.invalid:7447",), set(), ("tcp/nobody.invalid:7447",)),
+        # the name was resolved before
+        ("peer", ("tcp/nobody.invalid:7447",), {"tcp/10.0.0.7:7447"}, ()),
+        ("peer", ("tls/nobody.invalid:7447",), {A}, ("tls/nobody.invalid:7447",)),
+        ("peer", ("tls/127.0.0.1:7447",), {A}, ("tls/127.0.0.1:7447",)),
+        ("peer", ("tcp/127.0.0.1:7447?rel=0",), {A}, ()),
+        ("peer", ("tcp/[::1]:7447",), {"tcp/[::1]:7447"}, ()),
+        ("peer", ("unixsock-stream//run/zenoh",), set(), ("unixsock-stream//run/zenoh",)),
+        ("client", (A, B), {B}, ()),
+        ("client", (A, B), set(), (A, B)),
+    ],
+)
+def test_an_endpoint_without_a_link_to_it_is_missing(
+    mode: str, endpoints: tuple[str, ...], ends: set[str], missing: tuple[str, ...]
+) -> None:
+    assert unreached(mode, endpoints, ends) == missing

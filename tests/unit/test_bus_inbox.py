@@ -1,4 +1,4 @@
-"""A step processes a limited number of inbox items, and the replies are sent in order."""
+"""What arrives on the bus is queued, bounded and counted."""
 
 from __future__ import annotations
 

@@ -1,7 +1,8 @@
-"""Tests of a serial device on a pty: why it cannot be opened, and how it is closed."""
+"""A serial device on a pty: why it cannot be opened, how it is closed, and the simulated one."""
 
 from __future__ import annotations
 
+import asyncio
 import errno
 import fcntl
 import itertools
@@ -9,12 +10,16 @@ import os
 import pty
 import termios
 import threading
-from collections.abc import Iterator
+import tty
+from collections.abc import Callable, Iterator
 
 import pytest
 from serial import SerialException
 
+from acsard.core.config.settings import Config, SimConfig
+from acsard.core.simulator.faults import USB_PACKET
 from acsard.daemon.serial.device import close, draining, open_raw, refusal, unsent
+from acsard.daemon.serial.simulator_pty import Simulated
 from acsard.host import clock
 from acsard.host.errors import Exit, InUseError
 from tests.each import each
@@ -147,3 +152,46 @@ def test_a_read_from_a_closed_port_reports_a_lost_device(path: str) -> None:
     device.close()
     with pytest.raises(SerialException):
         device.read(1)
+
+
+LINE = b"ap00.00,bp00.00,cp00.00,dp00.00\n"
+
+
+async def first_piece(faults: tuple[str, ...], enough: Callable[[bytes], bool]) -> bytes:
+    """Send lines and read one piece of data after each, until `enough` accepts a piece.
+
+    Return it.
+    """
+    future: asyncio.Future[bytes] = asyncio.get_running_loop().create_future()
+    with Simulated(Config(sim=SimConfig(faults=faults))) as simulated:
+        device = os.open(simulated.path, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
+        tty.setraw(device)
+
+        def more() -> None:
+            piece = os.read(device, 4096)
+            os.write(device, LINE)
+            if enough(piece) and not future.done():
+                future.set_result(piece)
+
+        asyncio.get_running_loop().add_reader(device, more)
+        try:
+            os.write(device, LINE * 12)
+            return await asyncio.wait_for(future, 20.0)
+        finally:
+            asyncio.get_running_loop().remove_reader(device)
+            os.close(device)
+
+
+def test_with_ftdi_replies_come_in_the_adapters_packets_and_not_line_by_line() -> None:
+    def packets(piece: bytes) -> bool:
+        # A late read may also get the rest that the adapter sent after its latency.
+        return len(piece) % USB_PACKET == 0 and not piece.endswith(b"\n")
+
+    assert asyncio.run(first_piece(("ftdi",), packets))
+
+
+def test_several_simulated_faults_act_together() -> None:
+    def noisy(piece: bytes) -> bool:
+        return b"\x00\xff~ap0.00, bp" in piece
+
+    assert asyncio.run(first_piece(("noise", "spaces", "unpadded"), noisy))
