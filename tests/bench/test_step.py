@@ -37,7 +37,7 @@ from acsard.core.values import Instant, Pose, PoseCovariance, Received
 from acsard.daemon.control_loop import Step
 from acsard.daemon.pacing import NO_PERIOD, Period
 from tests.scenarios.world import World
-from tests.unit.core.motion.odometer import arc
+from tests.unit.odometer import arc
 
 pytestmark = [pytest.mark.bench, pytest.mark.timeout(300)]
 

@@ -1,6 +1,6 @@
 """The odometry of drives with bursts of lost lines.
 
-The tests compare `state` with the simulated robot. `unit/core/link/test_bursts.py` tests the
+The tests compare `state` with the simulated robot. `unit/test_covariance_nees.py` tests the
 covariance of 1000 robots that lose plain lines.
 """
 

@@ -16,7 +16,7 @@ from acsard.core.config.settings import Config, McuConfig, SimConfig
 from acsard.core.values import Pose
 from tests.scenarios.world import World
 from tests.stepped import Outputs
-from tests.unit.core.motion.odometer import arc
+from tests.unit.odometer import arc
 
 
 class Square:

@@ -15,7 +15,7 @@ from acsard.core.messages.schema import JointState, RobotState
 from acsard.core.values import Estimate, Pose
 from tests.scenarios.world import World
 from tests.stepped import Outputs
-from tests.unit.core.motion.odometer import arc
+from tests.unit.odometer import arc
 
 FINE = SimConfig(encoder_counts=20_000)
 """Fine encoders, so that the two decimals of a line limit its accuracy."""

@@ -1,12 +1,8 @@
-"""Random networks between a sender and the daemon, in which the true age of each command is known.
-
-`python -m tests.unit.networks 10000` plays so many, and prints what it measured.
-"""
+"""Random networks between a sender and the daemon; the true age of each command is known."""
 
 from __future__ import annotations
 
 import random
-import sys
 from collections.abc import Callable, Iterator
 
 from msgspec import Struct
@@ -201,28 +197,3 @@ def random_network(dice: random.Random) -> Network:
 
 # Round trip and share of peaks, with the largest share of prompt commands that may be refused.
 ROUND_TRIPS = {"LAN": (0.002, 0.0, 0.005), "100 ms": (0.1, 0.02, 0.02), "200 ms": (0.2, 0.0, 0.05)}
-
-
-def main(count: int) -> None:
-    dice, oldest, unstamped = random.Random(1), 0.0, 0.0
-    shares = [0, 0, 0, 0]
-    for _ in range(count):
-        network = random_network(dice)
-        echo, stamp = play(network, True, dice), play(network, False, dice)
-        oldest = max(oldest, echo.oldest)
-        shares[0], shares[1] = shares[0] + echo.refused, shares[1] + echo.prompt
-        if not (network.queued or network.step or network.suspended):
-            unstamped = max(unstamped, stamp.oldest)
-            shares[2], shares[3] = shares[2] + stamp.refused, shares[3] + stamp.prompt
-    print(f"{count} random networks: oldest obeyed command by echo {oldest:.3f} s")
-    print(f"by stamp, without a set clock, a suspend or a queue from the start {unstamped:.3f} s")
-    print(f"prompt commands refused: echo {shares[0] / shares[1]:.2%}, stamp "
-          f"{shares[2] / max(1, shares[3]):.2%}")  # fmt: skip
-    for name, (way, peaks, _) in ROUND_TRIPS.items():
-        network = Network(jitter(dice, way / 2, peaks), jitter(dice, way / 2, peaks), seconds=600)
-        figures = [play(network, echoes, dice) for echoes in (True, False)]
-        print(name, *(f"{one.refused / one.prompt:.2%}" for one in figures))
-
-
-if __name__ == "__main__":
-    main(int(sys.argv[1]))

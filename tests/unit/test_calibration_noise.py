@@ -41,8 +41,8 @@ from tests.unit.calibration_robots import (
     drive,
     wander,
 )  # fmt: skip
-from tests.unit.core.motion.nees import AT, errors
-from tests.unit.core.motion.odometer import Odometer
+from tests.unit.nees import AT, errors
+from tests.unit.odometer import Odometer
 
 LINES = 5
 """Feedback lines that are joined to one for the odometry, to save time. Noise adds up."""

@@ -147,7 +147,8 @@ def test_the_stop_is_reported_once_and_refuses_clear_until_the_hysteresis() -> N
     assert pack.stops == 2
     first, *_, last = pack.events  # the mean rises through each of the levels
     assert first[0] == last[0] == "battery_stop"
-    assert sum("stays stopped until srv/clear" in text for _, text in pack.events) == 1
+    (text,) = [text for _, text in pack.events if "stays stopped until srv/clear" in text]
+    assert "below battery.warning_below = 21.5 V" in text
 
 
 def test_an_exchanged_battery_ends_the_stop_within_seconds() -> None:

@@ -308,6 +308,8 @@ def test_a_board_that_has_reported_a_press_must_report_the_release(new: type) ->
 
 
 def test_each_board_must_report_the_required_inputs_before_the_robot_is_ready() -> None:
+    rig = Rig(Config(safety=SafetyConfig(estop="required"))).linked()
+    assert (rig.mode, rig.board(OK).step().mode) == ("waiting", "ready")
     one = b"!status estop=ok bumpers=.\r\n"
     rig = Rig(Config(safety=SafetyConfig(estop="required", bumpers=("front",))))
     out = rig.linked().step(GO)

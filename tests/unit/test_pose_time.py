@@ -1,10 +1,10 @@
-"""Consecutive good lines get their time from the wire and the wheels' angles from the counts."""
+"""The time of each sample: from the wire, the board's clock, or the lines that it answers."""
 
 from __future__ import annotations
 
 import math
 from time import process_time
-from typing import Literal
+from typing import Any, Literal
 
 import pytest
 
@@ -13,6 +13,7 @@ from acsard.core.link.checked_line import Reading
 from acsard.core.link.feedback import Feedback, Timeline
 from acsard.core.link.link_setup import LinkSetup
 from acsard.core.values import Instant, WheelSpeeds
+from tests.each import each
 
 MS = 1_000_000
 SPEEDS = WheelSpeeds(1.0, 2.0, 3.0, 4.0)
@@ -69,90 +70,50 @@ def test_the_first_line_has_a_time_but_neither_dt_nor_gap() -> None:
     )
 
 
-def test_bytes_that_follow_a_line_make_it_older() -> None:
-    bench = Bench()
-    assert bench.line(following=12).at.mono_ns == bench.now_ns - 1_041_666 - WIRE_NS
+Line = dict[str, Any]
+Sample = tuple[float, float, tuple[int, ...] | None]
+ZERO = {"counts": (0, 0, 0, 0)}
+ONE = {"counts": (10, 10, 10, 10)}
+COUNTED: dict[str, tuple[list[Line], Sample]] = {
+    # Lines, and dt, gap and the angles of the last one in tenths of a degree.
+    "the host's clock": ([{}, {"ms": 12}], (0.012, 0.0, None)),
+    "the board's clock": (
+        [ZERO, {"counts": (10, -20, 30, 0), "ms": 17, "mcu_ms": 10}], (0.01, 0.0, (10, -20, 30, 0)),
+    ),
+    "the first counts": ([{}, ONE], (0.01, 0.0, None)),
+    "a line without counts": ([ZERO, {}, ONE], (0.01, 0.0, None)),
+    "after that line": ([ZERO, {}, ZERO, ONE], (0.01, 0.0, (10, 10, 10, 10))),
+    "a gap that counts fill": (
+        [ZERO, {"counts": (170, 340, 520, 690), "ms": 300, "gap": True}],
+        (0.0, 0.3, (170, 340, 520, 690)),
+    ),
+    "a gap in which they may wrap": ([ZERO, ONE | {"ms": 3000, "gap": True}], (0.0, 3.0, None)),
+    "a leap": ([ZERO, {"counts": (9000, 0, 0, 0)}], (0.01, 0.0, None)),
+    "a restart": ([ZERO, ZERO | {"mcu_ms": -500}], (0.0, 0.01, None)),
+    "behind a restart": ([ZERO, ZERO | {"mcu_ms": -500}, ONE], (0.01, 0.0, (10, 10, 10, 10))),
+}  # fmt: skip
 
 
-def test_without_counts_dt_comes_from_the_hosts_clock() -> None:
-    bench = Bench()
-    bench.line()
-    sample = bench.line(ms=12)
-    assert (sample.dt, sample.turned) == (0.012, None)
+@each("name", COUNTED)
+def test_the_time_and_the_angles_of_a_line(name: str) -> None:
+    bench, (lines, (dt, gap, angles)) = Bench(), COUNTED[name]
+    for line in lines:
+        more = {name: value for name, value in line.items() if name != "counts"}
+        sample = bench.line(*line.get("counts", ()), **more)
+    assert (sample.dt, sample.gap) == (dt, gap)
+    tenths = None if sample.turned is None else [angle / DEGREE * 10 for angle in sample.turned]
+    assert tenths == (None if angles is None else pytest.approx(angles))
+    assert bench.timeline.restarted == (name == "a restart")
+    assert bench.timeline.leaps == (name == "a leap")
 
 
-def test_with_counts_dt_comes_from_the_mcu_and_the_angles_come_from_the_counts() -> None:
-    bench = Bench()
-    bench.line(0, 0, 0, 0)
-    sample = bench.line(10, -20, 30, 0, ms=17, mcu_ms=10)
-    assert sample.dt == 0.01
-    assert sample.turned == pytest.approx((DEGREE, -2 * DEGREE, 3 * DEGREE, 0.0))
-
-
-def test_the_wheel_map_assigns_counts_and_signs_to_the_wheels() -> None:
+def test_counts_have_the_wheel_map_and_are_used_only_if_they_are_configured() -> None:
     bench = Bench(WheelMap("-d", "+c", "-b", "+a"))
     bench.line(0, 0, 0, 0)
-    sample = bench.line(10, 20, 30, 40)
-    assert sample.turned == pytest.approx((-4 * DEGREE, 3 * DEGREE, -2 * DEGREE, DEGREE))
-
-
-def test_the_first_counts_fall_back_to_speed_times_time() -> None:
-    bench = Bench()
-    bench.line()
-    sample = bench.line(5, 5, 5, 5)
-    assert (sample.dt, sample.turned) == (0.01, None)
-
-
-def test_counts_are_not_compared_across_a_line_without_counts() -> None:
-    bench = Bench()
-    bench.line(0, 0, 0, 0)
-    bench.line()
-    assert bench.line(10, 10, 10, 10).turned is None
-    assert bench.line(20, 20, 20, 20).turned == pytest.approx((DEGREE,) * 4)
-
-
-def test_counts_fill_a_gap_that_is_short_enough() -> None:
-    bench = Bench()
-    bench.line(0, 0, 0, 0)
-    sample = bench.line(170, 340, 520, 690, ms=300, gap=True)
-    assert (sample.dt, sample.gap) == (0.0, 0.3)
-    assert sample.turned == pytest.approx((17 * DEGREE, 34 * DEGREE, 52 * DEGREE, 69 * DEGREE))
-
-
-def test_counts_do_not_fill_a_gap_in_which_they_could_have_wrapped() -> None:
-    bench = Bench()
-    bench.line(0, 0, 0, 0)
-    sample = bench.line(100, 100, 100, 100, ms=3000, gap=True)
-    assert (sample.dt, sample.gap, sample.turned) == (0.0, 3.0, None)
-    assert not bench.timeline.restarted
-
-
-def test_a_restarted_clock_is_reported_and_is_a_gap() -> None:
-    bench = Bench()
-    bench.line(900, 0, 0, 0)
-    sample = bench.line(0, 0, 0, 0, ms=10, mcu_ms=-500)
-    assert bench.timeline.restarted
-    assert (sample.dt, sample.gap, sample.turned) == (0.0, 0.01, None)
-    bench.line(0, 0, 0, 0)
-    assert not bench.timeline.restarted
-
-
-def test_after_a_leap_of_the_counts_the_speeds_are_used_and_the_leap_is_counted() -> None:
-    bench = Bench()
-    bench.line(0, 0, 0, 0)
-    sample = bench.line(9000, 0, 0, 0)
-    assert (sample.dt, sample.turned) == (0.01, None)
-    assert (bench.timeline.leaps, bench.timeline.restarted) == (1, False)
-
-
-def test_after_forgetting_no_angle_comes_from_the_first_counts() -> None:
-    bench = Bench()
-    bench.line(0, 0, 0, 0)
+    angles = bench.line(10, 20, 30, 40).turned
+    assert angles == pytest.approx((-4 * DEGREE, 3 * DEGREE, -2 * DEGREE, DEGREE))
     bench.timeline.forget()
-    assert bench.line(10, 10, 10, 10).turned is None
-
-
-def test_counts_are_ignored_unless_they_are_configured() -> None:
+    assert bench.line(20, 20, 30, 40).turned is None
     bench = Bench(counts=0)
     bench.line(0, 0, 0, 0)
     assert bench.line(10, 10, 10, 10).turned is None

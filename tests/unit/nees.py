@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from acsard.core.config.settings import OdometryConfig
 from acsard.core.link.feedback import Feedback
 from acsard.core.values import Instant, WheelSpeeds
-from tests.unit.core.motion.odometer import Odometer
+from tests.unit.odometer import Odometer
 
 Array = NDArray[np.float64]
 

@@ -1,7 +1,4 @@
-"""The daemon computes whole counts from the speeds of a line.
-
-This works although the daemon knows the time of the line only to a few ms.
-"""
+"""Whole counts from the speeds of a line, and the smallest step of a speed."""
 
 from __future__ import annotations
 
@@ -12,15 +9,156 @@ from collections.abc import Iterator
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from acsard.core.link.codec import Motors
 from acsard.core.link.feedback import Feedback
-from acsard.core.link.quantization import CountRecovery
+from acsard.core.link.quantization import BLOCK_STEPS, FIRST_STEPS, CountRecovery, Steps
 from acsard.core.link.whole_counts import MAX_DOUBT
 from acsard.core.link.whole_counts import WholeCounts as Recovered
 from acsard.core.values import Instant, WheelSpeeds
 from tests.each import each
-from tests.unit.core.link.counted import PERIOD, Array, angles, counted
+
+Array = NDArray[np.float64]
+RADIUS, TRACK, PERIOD = 0.05, 0.30, 0.01
+AT = Instant(0, 0)
+
+
+def sides(rng: np.random.Generator, seconds: float) -> Array:
+    """Return the mean speeds of both sides in each period, rad/s, shape (periods, 2).
+
+    The right side comes first.
+    """
+    v = w = 0.0
+    rows, goal, left = [], (0.0, 0.0), 100
+    for _ in range(round(seconds / PERIOD)):
+        if left == 0:
+            stop = rng.random() < 0.1
+            goal = (0.0, 0.0) if stop else (rng.uniform(0.6, 1.2), rng.uniform(-1.2, 1.2))
+            left = int(rng.uniform(50, 400))
+        left -= 1
+        v += max(-PERIOD, min(PERIOD, goal[0] - v))
+        w += max(-4 * PERIOD, min(4 * PERIOD, goal[1] - w))
+        rows.append(((v + w * TRACK / 2) / RADIUS, (v - w * TRACK / 2) / RADIUS))
+    return np.array(rows)
+
+
+def angles(rng: np.random.Generator, seconds: float) -> Array:
+    """Return the wheels' true angles, rad, shape (periods + 1, 4).
+
+    Each wheel starts at a random angle.
+    """
+    turned = sides(rng, seconds) * PERIOD
+    wheels = np.vstack([np.zeros(4), np.cumsum(turned[:, [0, 1, 1, 0]], axis=0)])
+    return wheels + rng.uniform(0, math.tau, 4)
+
+
+def counted(wheels: Array, counts: int | NDArray[np.int_]) -> Array:
+    """Return the whole counts of each wheel in each period, shape (periods, 4).
+
+    `counts` is the number of counts per turn.
+    """
+    deltas: Array = np.diff(np.floor(wheels / math.tau * counts), axis=0)
+    return deltas
+
+
+def speeds(counts: int) -> Array:
+    """Return the speeds that firmware reports in half a minute, in two decimals."""
+    whole = counted(angles(np.random.default_rng(1), 30.0), counts)
+    values: Array = np.round(whole * math.tau / counts / PERIOD, 2)
+    return values
+
+
+def recover(
+    recovery: CountRecovery, rows: Array, configured: int = 0, counts: bool = False
+) -> list[Feedback]:
+    """Process each row as a line. With `counts`, the lines contain counts."""
+    angle = math.tau / configured if configured else 0.0
+    turned = (0.0,) * 4 if counts else None
+    lines = (Feedback(AT, WheelSpeeds(*row), PERIOD, turned=turned) for row in rows.tolist())
+    return [recovery.recover_counts(line, angle) for line in lines]
+
+
+def test_without_configured_counts_no_line_has_whole_counts_and_coarse_lines_are_counted() -> None:
+    coarse, fine = CountRecovery(), CountRecovery()
+    assert all(
+        line.counted is None for line in recover(coarse, speeds(20)) + recover(fine, speeds(3200))
+    )
+    assert coarse.counts(0) == fine.counts(0) == (0,) * 4
+    assert coarse.coarse_lines > 1000
+    assert fine.coarse_lines == 0
+
+
+def test_after_forgetting_no_step_is_known() -> None:
+    recovery = CountRecovery()
+    recover(recovery, speeds(400))
+    recovery.forget()
+    (line,) = recover(recovery, speeds(400)[500:501])
+    assert line.steps == (math.inf,) * 4
+
+
+def test_no_counts_are_derived_from_speeds_if_the_line_has_its_own_counts() -> None:
+    lines = recover(CountRecovery(), speeds(20), 20, counts=True)
+    assert all(line.counted is None for line in lines)
+    assert max(lines[-1].steps) == pytest.approx(math.tau / 20 / PERIOD, abs=0.01)
+
+
+def test_a_randomly_jumping_wheel_beside_three_fine_ones_is_not_a_coarse_encoder() -> None:
+    dice, recovery = random.Random(1), CountRecovery()
+    for _ in range(1000):
+        fine = [round(5.0 + dice.uniform(-0.1, 0.1), 2) for _ in range(3)]
+        speeds = WheelSpeeds(round(dice.uniform(-70.0, 70.0), 2), *fine)
+        line = recovery.recover_counts(Feedback(AT, speeds, 0.01), 0.0)
+    assert max(line.steps) < 1.0
+
+
+def steps_after(speeds: list[float], steps: Steps | None = None) -> Steps:
+    steps = steps or Steps()
+    for speed in speeds:
+        steps.add(speed)
+    return steps
+
+
+def fine_speeds(count: int = 2 * BLOCK_STEPS) -> list[float]:
+    dice = random.Random(1)
+    return [round(10 + dice.uniform(-0.2, 0.2) + 0.02 * i, 2) for i in range(count)]
+
+
+def test_the_quantization_step_is_unknown_until_enough_steps_were_seen() -> None:
+    speeds = [0.1 * (i % 2) for i in range(FIRST_STEPS)]
+    steps = steps_after(speeds)
+    assert steps.size == math.inf
+    steps.add(0.2)
+    assert steps.size < 0.3
+
+
+@pytest.mark.parametrize("counts", [16, 20, 96])
+def test_the_quantization_step_of_whole_counts_is_one_count(counts: int) -> None:
+    quantum, dice = math.tau / counts / 0.01, random.Random(2)
+    steps = steps_after([quantum * dice.randint(0, 1) for _ in range(6 * BLOCK_STEPS)])
+    assert steps.size == pytest.approx(quantum)
+
+
+@pytest.mark.parametrize("share", [0.3, 0.5, 0.8])
+def test_a_filter_reduces_the_quantization_step_by_its_share(share: float) -> None:
+    speed, speeds, quantum = 0.0, [], 31.4
+    for i in range(400):
+        speed += share * ((0.0 if i % 9 else quantum) - speed)
+        speeds.append(round(speed, 2))
+    assert steps_after([0.0, *speeds]).size > 0.4 * share * quantum
+
+
+def test_one_damaged_line_does_not_change_the_quantization_step() -> None:
+    steps = steps_after(fine_speeds(2 * BLOCK_STEPS + 8))
+    steps_after([40.0, 12.0], steps)
+    assert steps.size < 0.5
+
+
+def test_a_quantization_step_that_does_not_recur_is_forgotten() -> None:
+    steps = steps_after([0.0, 30.0] * BLOCK_STEPS)
+    assert steps.size == 30.0
+    steps_after(fine_speeds(3 * BLOCK_STEPS), steps)
+    assert steps.size < 0.5
 
 
 class WholeCounts:
@@ -76,28 +214,12 @@ def test_a_fine_encoder_loses_few_counts() -> None:
     assert missed(400, 0.0005).max() < 3.0
 
 
-def test_speed_times_time_alone_is_more_than_one_count_off() -> None:
-    error = sum(
-        np.array(speeds) * own / (math.tau / 16) - number
-        for speeds, own, number in lines(16, 0.002)
-    )
-    assert np.abs(error).max() > 1.0
-
-
 def test_a_line_that_repeats_the_previous_one_turns_no_wheel() -> None:
     counter, speed = WholeCounts(16), round(math.tau / 16 / 0.008, 2)
     speeds = (speed, 0.0, speed, 0.0)
     assert counter.turned(speeds, 0.008) == (counter.angle, 0.0, counter.angle, 0.0)
     assert counter.turned(speeds, 0.003) == (0.0, 0.0, 0.0, 0.0)
     assert counter.turned(speeds, 0.005) == (counter.angle, 0.0, counter.angle, 0.0)
-
-
-def test_the_other_wheels_decide_between_two_possible_numbers_of_counts() -> None:
-    counter = WholeCounts(96)
-    true = [round(n * counter.angle / 0.0139, 2) for n in (3, 3, 2, -3)]
-    turned = counter.turned((true[0], true[1], true[2], true[3]), 0.0105)
-    assert turned is not None
-    assert [round(angle / counter.angle, 6) for angle in turned] == [3, 3, 2, -3]
 
 
 def test_a_wrong_number_of_counts_is_corrected_by_the_next_line() -> None:
@@ -162,10 +284,6 @@ def test_one_damaged_line_does_not_refute_whole_counts() -> None:
         if number > 302 and turned is not None:
             assert [round(angle / counter.angle) for angle in turned] == whole.tolist()
     assert counter.believed
-
-
-def test_zero_speeds_give_zero_angles() -> None:
-    assert WholeCounts(16).turned((0.0, 0.0, 0.0, 0.0), 0.01) == (0.0, 0.0, 0.0, 0.0)
 
 
 def off_by(lost: str, counts: int, jitter: float) -> float:

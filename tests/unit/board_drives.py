@@ -1,7 +1,7 @@
 """Random drives, the lines that an MCU makes from them, and the times at which a host reads them.
 
-The tests compare the pose of the session under test with the true path. They also compare it with
-the floor, which is the pose if each line had its true time. The seed determines all random numbers.
+The tests compare the pose of the session under test with that of the encoders' counts. The seed
+determines all random numbers.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from acsard.core.link.feedback import Feedback
 from acsard.core.link.link_setup import LinkSetup
 from acsard.core.link.session import McuSession
 from acsard.core.values import NS_PER_S, Instant, Pose, Received, WheelSpeeds
-from tests.unit.core.motion.odometer import Odometer, arc
+from tests.unit.odometer import Odometer, arc
 
 RATE = 100.0
 PERIOD, DRIFT = 0.01, 2e-4
@@ -124,8 +124,6 @@ class Case(Struct, frozen=True):
     """Mean time between bursts of 0.1 to 0.5 s of lost lines, s; 0 means that there are none."""
     counts: int = 0
     """Counts per turn of the encoders; 0 means that they have no steps."""
-    configured: int | None = None
-    """`mcu.encoder_counts`; None means that it is right."""
     checked: bool = False
     """Whether commands and replies have a number and a checksum, and replies the counts, too."""
 
@@ -140,32 +138,24 @@ class Line(Struct):
 
 
 class Host:
-    """The session under test, its pose, and two poses from the same lines for comparison."""
+    """The session under test, its pose, and the pose from the encoders' counts."""
 
     def __init__(self, case: Case, seed: int, seconds: float) -> None:
         self.case, self.seconds = case, seconds
         self.rng = rng = np.random.default_rng(seed)
         self.path = Path(rng, seconds)
-        configured = case.counts if case.configured is None else case.configured
         mcu = McuConfig(
             reply_period=0.0 if case.prompted else PERIOD,
-            encoder_counts=configured,
+            encoder_counts=case.counts,
             link_check="on" if case.checked else "off",
         )
         self.setup, self.session = LinkSetup.of(mcu, RATE), McuSession()
-        self.found = Odometer(counts=configured)
-        self.floor, self.by_arrival, self.counter = Arcs(), Arcs(), Arcs()
-        """Poses from each line's true time, from arrival times, and from the encoders' counts.
-
-        `found` is the session's.
-
-        By arrival times, each line's speed applies since the line before it.
-        """
+        self.found = Odometer(counts=case.counts)
+        self.counter = Arcs()  # the pose from the encoders' counts; `found` is the session's
         self.lines: list[Line] = []
         self.heard: list[Feedback] = []
         self.now = 0.0
         """Time of the last step, s."""
-        self._heard_ns = 0
         self._reported = 0.0
         self._wheels = self._turned(0.0)
         self._stalls = _times(rng, seconds, case.stall_every, case.stall) if case.stall else []
@@ -195,8 +185,6 @@ class Host:
         line = Line(at, self._reported, speeds, self._encoded(speeds, at, now, command))
         self._reported = at
         self.lines.append(line)
-        right, left = speeds.front_right + speeds.rear_right, speeds.front_left + speeds.rear_left
-        self.floor.roll(left / 2 * dt, right / 2 * dt)
         self.counter.roll((b + c) / 2, (a + d) / 2)
         return line
 
@@ -277,33 +265,6 @@ class Host:
         for feedback in self.session.update(self.setup, now, True, 1, received):
             self.heard.append(feedback)
             self.found.fold(feedback)
-            since = (feedback.heard_ns - (self._heard_ns or feedback.heard_ns)) / NS_PER_S
-            self._heard_ns = feedback.heard_ns
-            speeds = feedback.speeds
-            self.by_arrival.roll(speeds.front_left * since, speeds.front_right * since)
-
-    # the end of the drive
-
-    def errors(self) -> np.ndarray:
-        """Return the final errors, in m and deg, of four poses.
-
-        They come from the session, true times (the floor), arrival times, and the counts.
-        """
-        truth = self._truth()
-        rows = []
-        for odometry in (self.found, self.floor, self.by_arrival, self.counter):
-            pose = odometry.pose
-            turn = math.degrees(math.remainder(pose.yaw - truth.yaw, math.tau))
-            rows.append((math.hypot(pose.x - truth.x, pose.y - truth.y), abs(turn)))
-        return np.array(rows)
-
-    def _truth(self) -> Pose:
-        truth, (left, right) = Arcs(), (0.0, 0.0)
-        end = self.lines[-1].at
-        for at in (*np.arange(0.005, end, 0.005).tolist(), end):
-            (was_left, was_right), (left, right) = (left, right), self.path.angles(at)
-            truth.roll(left - was_left, right - was_right)
-        return truth.pose
 
 
 class Arcs:
@@ -400,3 +361,8 @@ def _read_until(host: Host, arrivals: deque[tuple[float, bytes]], tick: float) -
         while arrivals and arrivals[0][0] <= at:
             data += arrivals.popleft()[1]
         host.read(at, data)
+
+
+def print_row(name: str, goal: str, result: str) -> None:
+    """Print one row of a table of results."""
+    print(f"\n{name:46} goal {goal:38} found {result}", end="")

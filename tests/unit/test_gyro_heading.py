@@ -1,7 +1,4 @@
-"""Tests of odometry with a gyro.
-
-Odometry compares each turn that the wheels report with the gyro, and corrects it, exactly once.
-"""
+"""The heading by odometry with a gyro: each turn of the wheels is compared and corrected once."""
 
 from __future__ import annotations
 
@@ -18,8 +15,8 @@ from acsard.core.motion.gyro import Gyro, Turn
 from acsard.core.motion.kinematics import Kinematics
 from acsard.core.motion.uncertainty import ErrorModel
 from acsard.core.values import NS_PER_S, GyroSample, Instant, Twist, WheelSpeeds
-from tests.unit.core.motion.liars import fold
-from tests.unit.core.motion.odometer import Odometer
+from tests.unit.liars import fold
+from tests.unit.odometer import Odometer
 
 KINEMATICS = Kinematics(DriveConfig())
 
@@ -90,22 +87,6 @@ def test_the_turn_of_the_wheels_that_a_gyro_gets_is_the_turn_of_the_heading(
             robot.fold(feedback_of(state))
     off = math.remainder(robot.pose.yaw - listening.by_wheels, math.tau)
     assert off == pytest.approx(0.0, abs=1e-9)
-
-
-def test_a_gap_before_a_skipped_line_counts_for_the_next_line() -> None:
-    robot = Odometer()
-    robot.fold(feedback_of(Line(10.0, 10.0)))
-    robot.skip(feedback_of(Line(10.0, 10.0, gap=0.5)))
-    robot.fold(feedback_of(Line(10.0, 10.0)))
-    assert robot.odometry.counters() == {"gaps": 1, "gap_ms": 500}
-
-
-def test_the_gyro_is_compared_with_the_wheels_over_no_unknown_distance() -> None:
-    robot, listening = Odometer(), Listening()
-    robot.use(listening)
-    for state in (Line(9.0, 9.0), Line(9.0, 9.0, bridged=0.3), Line(9.0, 9.0, gap=0.5)):
-        robot.fold(feedback_of(state))
-    assert listening.seconds == [0.01, pytest.approx(0.31), 0.0]
 
 
 class Turning:

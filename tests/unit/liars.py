@@ -20,7 +20,7 @@ from acsard.core.config.settings import DriveConfig
 from acsard.core.link.feedback import Feedback
 from acsard.core.motion.kinematics import Kinematics
 from acsard.core.values import Estimate, Instant, Pose, WheelSpeeds
-from tests.unit.core.motion.odometer import Odometer, arc
+from tests.unit.odometer import Odometer, arc
 
 Array = NDArray[np.float64]
 

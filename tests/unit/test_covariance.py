@@ -1,0 +1,358 @@
+"""The covariance of the pose and the variances of the twist, worked by hand."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from msgspec.structs import replace
+
+from acsard.core.config.settings import DriveConfig, LimitsConfig, OdometryConfig
+from acsard.core.motion.gyro import Turn
+from acsard.core.motion.kinematics import Kinematics
+from acsard.core.motion.uncertainty import UNKNOWN_POSE, ErrorModel
+from acsard.core.values import Estimate, Pose, PoseCovariance
+from tests.each import each
+from tests.unit.nees import PERIOD, RADIUS, TRACK, Model
+from tests.unit.odometer import Odometer
+from tests.unit.test_pose import Says, counts, feedback, line, moves
+
+law = settings(max_examples=100)
+START = PoseCovariance(1e-6, 0.0, 0.0, 1e-6, 0.0, 1e-6)
+"""The default covariance of a pose that was just set."""
+EXACT = OdometryConfig(
+    distance_variance_per_metre=0.0, yaw_variance_per_metre=0.0, yaw_variance_per_radian=0.0
+)
+Matrix = np.ndarray[tuple[int, int], np.dtype[np.float64]]
+
+
+def matrix(p: PoseCovariance) -> Matrix:
+    rows = [[p.xx, p.xy, p.xyaw], [p.xy, p.yy, p.yyaw], [p.xyaw, p.yyaw, p.yawyaw]]
+    return np.array(rows, dtype=np.float64)
+
+
+def near(p: PoseCovariance, rel: float = 1e-4) -> object:
+    # The equations hold to first order; second order adds some millionths to these variances.
+    return pytest.approx(matrix(p), rel=rel, abs=1e-15)
+
+
+def test_a_pose_that_is_set_is_as_certain_as_at_the_start_and_standing_adds_nothing() -> None:
+    robot = Odometer()
+    for _ in range(100):
+        assert robot.fold(line(0.0)).covariance == START
+    assert robot.fold(line(0.0, 0.0, gap=2.0)).covariance == START
+    assert robot.fold(feedback(4.5, 7.5, 10.0)).covariance != START
+    robot.set_pose(Pose(5.0, 5.0, 1.0))
+    assert robot.fold(line(0.0)).covariance == START
+
+
+def straight(metres: float, yaw: float = 0.0) -> PoseCovariance:
+    """Return the covariance after a straight in this direction, driven forwards or backwards."""
+    robot, speed = Odometer(), math.copysign(10.0, metres)
+    robot.set_pose(Pose(0.0, 0.0, yaw))
+    robot.fold(line(0.0))
+    for _ in range(round(abs(metres) / 0.005)):
+        robot.fold(line(speed))
+    return robot.fold(line(0.0, 0.05)).covariance
+
+
+@each("metres", [1.0, -1.0, 2.0])
+def test_a_straight_adds_the_variance_worked_by_hand(metres: float) -> None:
+    # The noise is 1e-4 per metre along x and 1e-4 per metre of yaw. A heading error at s shears y
+    # by the rest of the way: yy has the integral of 1e-4 (d - s)^2, and yyaw that of 1e-4 (d - s).
+    d, noise = abs(metres), 1e-4
+    expected = PoseCovariance(
+        1e-6 + noise * d, 0.0, 0.0,
+        1e-6 + 1e-6 * d**2 + noise * d**3 / 3, metres * 1e-6 + noise * d * metres / 2,
+        1e-6 + noise * d,
+    )  # fmt: skip
+    ahead, left = straight(metres), straight(metres, math.pi / 2)
+    assert matrix(ahead) == near(expected, 2e-3)
+    turned = PoseCovariance(ahead.yy, 0.0, -ahead.yyaw, ahead.xx, 0.0, ahead.yawyaw)
+    assert matrix(left) == near(turned)
+
+
+@each("sign", [1.0, -1.0])
+def test_a_turn_in_place_makes_only_the_yaw_less_certain(sign: float) -> None:
+    # 1 rad x 1e-2 per radian, less the play of a 400th of a turn: 2 pi / 400 x 0.05 / 0.3 rad. Each
+    # side rolls 0.15 m. The side noise k = 1e-4 x 0.3 x 0.3 / 2 = 4.5e-6 makes up all of the yaw's
+    # variance per metre. It gives 4.5e-6 x 0.3 / 0.09 = 1.5e-5 of yaw, and 4.5e-6 x 0.3 / 4 =
+    # 3.375e-7 of position, a thousandth of the yaw's.
+    robot = Odometer(OdometryConfig(yaw_variance_per_metre=0.0))
+    covariance = robot.fold(feedback(-3.0 * sign, 3.0 * sign, 1.0)).covariance
+    yaw = 1e-6 + 1e-2 * (1 - math.pi / 1200)
+    assert matrix(covariance) == near(PoseCovariance(1e-6, 0, 0, 1e-6, 0, yaw))
+    covariance = Odometer().fold(feedback(-3.0 * sign, 3.0 * sign, 1.0)).covariance
+    assert covariance.yawyaw == pytest.approx(yaw + 1.5e-5)
+    assert covariance.xx + covariance.yy == pytest.approx(2e-6 + 3.375e-7)
+
+
+def test_turning_to_and_fro_counts_both_ways_but_trembling_within_a_count_does_not() -> None:
+    for sign in (1.0, -1.0):
+        robot = Odometer()
+        for turn in [15.0 * sign] * 100 + [-15.0 * sign] * 100:
+            estimate = robot.fold(feedback(-turn, turn, 0.01))
+        # The robot turns by 10 rad, less the play at the start and twice that at the reversal.
+        assert estimate.covariance.yawyaw == pytest.approx(0.01 * 10.0, rel=0.05)
+    robot = Odometer()
+    for turn in [0.3, -0.3] * 2000:
+        estimate = robot.fold(feedback(-turn, turn, 0.01))
+    assert estimate.covariance.yawyaw < 2e-5
+
+
+def test_coarse_encoder_counts_make_the_pose_less_certain() -> None:
+    covariance = Odometer(counts=20).fold(line(0.0)).covariance
+    # A count is 15.7 mm, and a wheel may be anywhere in it at the start and now. Each side is the
+    # mean of two wheels.
+    count = 0.05 * math.tau / 20
+    assert covariance.xx == pytest.approx(1e-6 + 2 * count**2 / 12 / 4)
+    assert covariance.yawyaw == pytest.approx(1e-6 + 2 * count**2 / 12 / 0.3**2)
+
+
+Moves = list[tuple[float, float, float]]
+
+
+@law
+@given(path=moves)
+def test_the_covariance_is_positive_and_moving_never_makes_the_pose_more_certain(
+    path: Moves,
+) -> None:
+    moved, gaps = Odometer(), Odometer()
+    yaw, volume = START.yawyaw, float(np.linalg.det(matrix(START)))
+    for left, right, dt in path:
+        covariance = moved.fold(feedback(left, right, dt)).covariance
+        grown = float(np.linalg.det(matrix(covariance)))
+        assert covariance.yawyaw >= yaw
+        assert grown >= volume * (1 - 1e-6)
+        yaw, volume = covariance.yawyaw, grown
+        # Motion lost on the way out may cancel motion lost on the way back.
+        gap = dt * 10 if dt > 0.05 else 0.0
+        lost = gaps.fold(feedback(left, right, 0.0 if gap else dt, gap=gap)).covariance
+        eigenvalues = np.linalg.eigvalsh(matrix(lost))
+        assert eigenvalues[0] > -1e-12 * eigenvalues[-1]
+
+
+# gaps
+
+
+def after_gap(gap: float, linear: float, angular: float) -> PoseCovariance:
+    """Return the covariance after a gap, s, from 0.3 m/s and 0.5 rad/s to this twist."""
+    robot = Odometer()
+    robot.fold(feedback(4.5, 7.5, 0.0))
+    left, right = (linear - 0.15 * angular) / 0.05, (linear + 0.15 * angular) / 0.05
+    return robot.fold(feedback(left, right, 0.0, gap=gap)).covariance
+
+
+def test_a_gap_adds_the_distance_at_the_speeds_around_it_to_the_deviation() -> None:
+    # The speed goes from 0.3 to 0.1 m/s at a constant 0.5 rad/s. The mean is 0.2 m/s and 0.5 rad/s,
+    # and the bound is three times that.
+    for gap in (0.15, 0.5):
+        grown = matrix(after_gap(gap, 0.1, 0.5)) - matrix(START)
+        assert (0.2 * gap) ** 2 <= grown[0, 0] <= 2 * (0.3 * gap) ** 2
+        assert (0.5 * gap) ** 2 <= grown[2, 2] <= 3 * (0.5 * gap) ** 2
+    # Ten gaps of 0.1 s at 0.5 m/s miss 0.5 m of the path, not 0.05 m x sqrt(10).
+    robot = Odometer()
+    for _ in range(10):
+        robot.fold(line(10.0))
+        estimate = robot.fold(line(10.0, 0.0, gap=0.1))
+    assert math.sqrt(estimate.covariance.xx) == pytest.approx(0.5, rel=0.01)
+
+
+def test_a_gap_of_years_leaves_a_variance_of_1e9_and_no_more() -> None:
+    robot = Odometer()
+    robot.fold(feedback(4.5, 7.5, 0.0))
+    covariance = robot.fold(feedback(4.5, 7.5, 0.0, gap=1e9)).covariance
+    assert (covariance.xx, covariance.yy, covariance.yawyaw) == (1e9, 1e9, 1e9)
+    assert robot.fold(feedback(4.5, 7.5, 1.0, gap=1.0)).covariance == UNKNOWN_POSE
+    robot = Odometer(OdometryConfig(yaw_variance_per_metre=10.0))
+    for _ in range(1000):  # an unknown heading adds no second order
+        estimate = robot.fold(line(20.0))
+    assert estimate.covariance.yawyaw > 90.0
+    assert max(map(abs, robot.odometry.uncertainty.bend.added)) < 1.0
+
+
+@each("dt", [0.11, 0.0])
+def test_a_gyro_measures_the_turn_of_a_gap_between_speeds_of_single_counts(dt: float) -> None:
+    robot = Odometer()
+    robot.use(Says(always=Turn(0.0, 1e-6, 0.0, 1e-3)))
+    for speed in (0.0, 6.5, 0.0, 6.5):
+        estimate = robot.fold(line(speed))
+    before = estimate.covariance
+    after = robot.fold(line(0.0, dt, gap=0.11 - dt, bridged=max(0.0, dt - 0.01))).covariance
+    assert after.xx > before.xx + 1e-5
+    assert after.yawyaw < before.yawyaw + 1e-5
+
+
+def driven(accelerations: list[float], gap: tuple[int, int]) -> tuple[float, float, float]:
+    """Drive with lines every 10 ms, of which those in `gap` are lost.
+
+    Returns the true distance, that of the odometry, and its standard deviation, m.
+    """
+    robot, speed, true, lost = Odometer(EXACT), 0.0, 0.0, 0
+    for number, acceleration in enumerate(accelerations):
+        # A report is the mean of its period.
+        before, speed = speed, max(0.0, min(1.0, speed + acceleration * 0.01))
+        mean = (before + speed) / 2
+        true += mean * 0.01
+        if gap[0] <= number < gap[1]:
+            lost += 1
+            continue
+        filled, lost = lost * 0.01, 0
+        estimate = robot.fold(line(mean / RADIUS, 0.01 + filled, bridged=filled, driven=1.0))
+    return true, estimate.pose.x, math.sqrt(estimate.covariance.xx - 1e-6)
+
+
+@each("seconds", [0.05, 0.15, 0.3, 0.9])
+def test_a_filled_gap_of_a_robot_within_its_limits_is_in_the_covariance(seconds: float) -> None:
+    """The acceleration changes at random in the gap, between the configured limits."""
+    dice, limit = np.random.default_rng(3), LimitsConfig().linear_acceleration
+    length = round(seconds * 100)
+    for _ in range(25):
+        phases = dice.uniform(-limit, limit, 16).repeat(10).tolist()
+        begin = int(dice.integers(20, 100))
+        true, found, std = driven([limit] * 50 + phases, (begin, begin + length))
+        assert abs(found - true) < 3.0 * std
+        assert abs(found - true) <= limit * seconds**2 / 4 + 0.01 * limit * seconds
+
+
+def test_errors_of_many_equal_silences_add_up() -> None:
+    """In each silence the robot brakes at its end, so that the trapezoid lacks the same motion."""
+    robot, true = Odometer(EXACT), 0.0
+    for _ in range(50):
+        robot.fold(line(10.0, 0.01, driven=1.0))
+        estimate = robot.fold(line(0.0, 0.31, bridged=0.3, driven=0.3))
+        true += 10.0 * RADIUS * 0.31
+    missing = true - estimate.pose.x
+    assert missing == pytest.approx(50 * 10.0 * RADIUS * 0.15, rel=0.1)
+    assert missing < 2.0 * math.sqrt(estimate.covariance.xx)
+
+
+@each(("driven_s", "moved"), [(0.3, True), (-0.2, False)])
+def test_a_robot_that_was_commanded_to_move_may_have_moved_between_two_rests(
+    driven_s: float, moved: bool
+) -> None:
+    robot = Odometer(EXACT)
+    start = robot.fold(line(0.0)).covariance
+    silences: list[dict[str, Any]] = [{"dt": 0.51, "bridged": 0.5}, {"dt": 0.0, "gap": 0.5}]
+    for silence in silences:
+        estimate = robot.fold(line(0.0, driven=driven_s, **silence))
+        assert (estimate.covariance.xx > start.xx + 0.05**2) == moved
+        start = estimate.covariance
+
+
+@each("share", [0.0, 0.3, 1.0])
+def test_a_pose_that_is_set_in_a_silence_knows_that_a_part_of_it_came_before(share: float) -> None:
+    """The line that ends the silence has the counts of all of it, and none says when they came."""
+    robot, turned = Odometer(), 8.0
+    robot.fold(counts(0.1, speed=10.0))
+    robot.set_pose(Pose(1.0, 2.0, 0.0))
+    estimate = robot.fold(counts(turned, dt=0.0, gap=0.5))
+    true = 1.0 + share * turned * RADIUS
+    assert abs(estimate.pose.x - true) < 1.1 * math.sqrt(estimate.covariance.xx)
+    assert estimate.positions == pytest.approx((0.1 + turned,) * 4)
+    later = robot.fold(counts(0.1, speed=10.0))
+    assert later.pose.x - estimate.pose.x == pytest.approx(0.1 * RADIUS)
+
+
+# the error model
+
+
+def test_a_certain_parameter_has_no_effect() -> None:
+    model = ErrorModel(OdometryConfig(gyro_scale_std=0.0), Kinematics(DriveConfig()))
+    assert model.bending == []
+    assert not any(any(effect) for effects in model.effects for effect in effects)
+
+
+@each(
+    ("setting", "distance", "turn"),
+    [
+        ("distance_scale_std", 0.01 * 2.0, 0.0),
+        ("wheel_separation_multiplier_std", 0.0, -0.01 * 3.0),
+        ("wheel_radius_ratio_std", 0.01 * 3.0 * TRACK / 4, 0.01 * 2.0 / TRACK),
+    ],
+)
+def test_an_effect_is_the_error_for_one_standard_deviation(
+    setting: str, distance: float, turn: float
+) -> None:
+    config = replace(OdometryConfig(), **{setting: 0.01})
+    model = ErrorModel(config, Kinematics(DriveConfig()))
+    ((of_distance, of_turn, turn_of_distance, turn_of_turn),) = [
+        row for row in model.effects[0] if any(row)
+    ]
+    assert of_distance * 2.0 + of_turn * 3.0 == pytest.approx(distance)
+    assert turn_of_distance * 2.0 + turn_of_turn * 3.0 == pytest.approx(turn)
+
+
+@each("noise", [(1e-4, 1e-4, 1e-2), (0.0, 1e-4, 0.0), (1e-4, 0.0, 1e-2)])
+def test_a_straight_has_the_variances_per_metre(noise: tuple[float, float, float]) -> None:
+    model = ErrorModel(Model(*noise).config(), Kinematics(DriveConfig()))
+    assert model.noise(2.0, 0.0, 0.0) == pytest.approx((2 * noise[0], 2 * noise[1], 0.0))
+
+
+# a turn that was missed
+
+
+def astray(missed: float, steps: int) -> tuple[Odometer, Estimate]:
+    """Drive straight on at 1 m/s, with a heading that is wrong by this deviation."""
+    robot = Odometer()
+    robot.odometry.uncertainty.miss("gyro", 0.0, missed, 0.0)
+    return robot, [robot.fold(line(20.0)) for _ in range(steps)][-1]
+
+
+@each("missed", [0.3, 0.7, 1.5, 4.0])
+def test_after_a_missed_turn_each_axis_is_as_uncertain_as_the_robots_are_apart(
+    missed: float,
+) -> None:
+    _, estimate = astray(missed, 500)
+    headings = np.random.default_rng(1).normal(0.0, missed, 10_000)
+    along, aside = 5.0 * (np.cos(headings) - 1.0), 5.0 * np.sin(headings)
+    stated = math.sqrt(estimate.covariance.xx), math.sqrt(estimate.covariance.yy)
+    for axis, errors in zip(stated, (along, aside), strict=True):
+        assert axis > 0.9 * float(np.sqrt((errors**2).mean()))
+    assert max(stated) < 5.0 * (missed + 1.5)
+
+
+@each("missed", [10.0**-exponent for exponent in range(1, 13)])
+def test_a_missed_turn_of_any_size_makes_the_robot_get_less_far(missed: float) -> None:
+    robot, estimate = astray(missed, 100)
+    # 1 - cos(e) is nearly e2 / 2, whose root mean square is sqrt(3) / 2 of the variance of e.
+    share = robot.odometry.uncertainty.astray / estimate.pose.x
+    assert share == pytest.approx(math.sqrt(0.75) * missed**2, rel=0.05, abs=0.0)
+
+
+# the twist
+
+
+def test_the_twist_of_a_robot_at_rest_is_certain() -> None:
+    robot = Odometer()
+    robot.fold(line(1.0))
+    for _ in range(19):
+        moving = robot.fold(line(0.0)).twist_variances
+    rest = robot.fold(line(0.0, 0.02)).twist_variances
+    assert moving.lateral == 1e-3
+    assert (rest.linear, rest.lateral, rest.angular) == (1e-8, 1e-8, 1e-8)
+    assert robot.fold(feedback(0.0, 0.1, 0.01)).twist_variances.angular > 1e-8
+
+
+@each(("encoder", "resolution"), [(0, 0.01), (400, math.tau / 400 / PERIOD)])
+def test_the_rounding_of_the_speeds_is_in_the_variance_of_the_turn_rate(
+    encoder: int, resolution: float
+) -> None:
+    robot = Odometer(EXACT, encoder)
+    for _ in range(20):
+        estimate = robot.fold(feedback(4.0, 5.0, PERIOD))
+    expected = (RADIUS / TRACK * resolution) ** 2 / 12
+    assert estimate.twist_variances.angular == pytest.approx(expected)
+
+
+def test_a_pose_integrated_from_twists_is_as_uncertain_as_the_odometry() -> None:
+    robot, along, yaw = Odometer(), 0.0, 0.0
+    for _ in range(1000):
+        estimate = robot.fold(line(10.0, PERIOD))
+        along += estimate.twist_variances.linear * PERIOD**2
+        yaw += estimate.twist_variances.angular * PERIOD**2
+    assert along == pytest.approx(estimate.covariance.xx, rel=0.1)
+    assert yaw == pytest.approx(estimate.covariance.yawyaw, rel=0.1)

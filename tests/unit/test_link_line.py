@@ -1,0 +1,315 @@
+"""The line to and from the board: written exactly, read strictly in meaning, leniently in form."""
+
+from __future__ import annotations
+
+import itertools
+import math
+import random
+from collections import Counter
+from collections.abc import Iterator
+from decimal import Decimal
+
+import msgspec
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from acsard.core.config.settings import DriveConfig, Motor, WheelMap
+from acsard.core.link.codec import Codec, FrameError
+from acsard.core.link.lines import MAX_LINE_BYTES, LineReader
+from acsard.core.motion.kinematics import Kinematics
+from acsard.core.values import Twist, WheelSpeeds
+from tests.each import each
+from tests.vectors.lines import (
+    ACCEPTED,
+    REFUSED,
+    SEED_LINE,
+    SEED_MOTORS,
+    SEED_REPLY,
+    WRITTEN,
+    ZERO,
+    Motors,
+)
+
+law = settings(max_examples=100)
+SEED_SPEEDS = WheelSpeeds(*SEED_MOTORS)
+CODEC = Codec(WheelMap())
+speeds = st.builds(WheelSpeeds, *[st.floats(allow_nan=False, allow_infinity=False)] * 4)
+small_speeds = st.builds(WheelSpeeds, *[st.floats(-101.0, 101.0)] * 4)
+_MOTORS: dict[str, Motor] = {
+    "+a": "+a", "-a": "-a", "+b": "+b", "-b": "-b", "+c": "+c", "-c": "-c", "+d": "+d", "-d": "-d",
+}  # fmt: skip
+
+
+def wheel_map(signs: str, letters: str) -> WheelMap:
+    return WheelMap(*(_MOTORS[sign + letter] for sign, letter in zip(signs, letters, strict=True)))
+
+
+wirings = st.builds(
+    wheel_map,
+    st.sampled_from(["".join(signs) for signs in itertools.product("+-", repeat=4)]),
+    st.permutations("abcd").map("".join),
+)
+
+
+def refusal(line: bytes) -> str:
+    with pytest.raises(FrameError) as caught:
+        CODEC.decode(line)
+    assert str(caught.value) == f"{caught.value.reason}: {line[:60]!r}"
+    return caught.value.reason
+
+
+# writing
+
+
+@each(
+    ("signs", "letters", "comma", "line"),
+    [
+        ("++++", "abcd", False, b"ap12.50,bn08.75,cp15.00,dn10.25\r\n"),  # 33 bytes
+        ("++++", "abcd", True, b"ap12.50,bn08.75,cp15.00,dn10.25,\r\n"),
+        ("-+-+", "abcd", False, b"an12.50,bn08.75,cn15.00,dn10.25\r\n"),
+        ("++++", "dcba", False, b"an10.25,bp15.00,cn08.75,dp12.50\r\n"),
+    ],
+)
+def test_the_seed_line_and_the_stop_byte_for_byte(
+    signs: str, letters: str, comma: bool, line: bytes
+) -> None:
+    codec = Codec(wheel_map(signs, letters), comma)
+    assert codec.encode(SEED_SPEEDS) == line
+    assert codec.decode(line.rstrip()) == SEED_SPEEDS
+    assert codec.stop == ZERO + b",\r\n"[not comma :]
+
+
+def test_a_left_turn_drives_a_and_d_forward_and_b_and_c_backward() -> None:
+    # 2 rad/s x 0.15 m / 0.05 m gives 6 rad/s.
+    left_turn = Kinematics(DriveConfig()).wheel_speeds(Twist(0.0, 2.0))
+    assert CODEC.encode(left_turn) == b"ap06.00,bn06.00,cn06.00,dp06.00\r\n"
+
+
+@each(("speed", "token"), WRITTEN)
+def test_a_speed_is_clamped_rounded_and_padded(speed: float, token: bytes) -> None:
+    assert CODEC.encode(WheelSpeeds(speed)) == b"a" + token + ZERO[7:] + b"\r\n"
+    assert CODEC.encode(WheelSpeeds(rear_right=speed)) == ZERO[:25] + token + b"\r\n"
+
+
+@each("bad", [math.nan, math.inf, -math.inf])
+@each("name", ["front_right", "front_left", "rear_left", "rear_right"])
+def test_a_speed_that_is_not_finite_raises_a_value_error(name: str, bad: float) -> None:
+    with pytest.raises(ValueError, match="not finite"):
+        CODEC.encode(WheelSpeeds(**{name: bad}))
+
+
+@law
+@given(wheels=speeds | small_speeds, wiring=wirings, comma=st.booleans())
+def test_each_line_has_four_padded_tokens_and_is_read_back_within_half_a_hundredth(
+    wheels: WheelSpeeds, wiring: WheelMap, comma: bool
+) -> None:
+    codec = Codec(wiring, comma)
+    line = codec.encode(wheels)
+    tokens = line.removesuffix(b",\r\n" if comma else b"\r\n").split(b",")
+    assert [chr(token[0]) for token in tokens] == list("abcd")
+    for token in tokens:
+        assert len(token) == 7
+        assert token[1:2] in (b"p", b"n")
+        assert token[4:5] == b"."
+        assert (token[2:4] + token[5:]).isdigit()
+        assert token[1:] != b"n00.00"
+    back = codec.decode(line.removesuffix(b"\r\n"))
+    for speed, read in zip(wheels.as_tuple(), back.as_tuple(), strict=True):
+        clamped = max(Decimal("-99.99"), min(Decimal("99.99"), Decimal(speed)))
+        assert abs(Decimal(str(read)) - clamped) <= Decimal("0.005000001")
+    assert codec.encode(back) == line
+
+
+# reading
+
+
+@each(("line", "motors"), ACCEPTED)
+def test_a_line_is_read_in_every_accepted_form(line: bytes, motors: Motors) -> None:
+    for comma in (False, True):
+        assert Codec(WheelMap(), comma).decode(line).as_tuple() == motors == independent(line)
+
+
+@each(("line", "reason"), [*REFUSED, (b"x" * 70, "malformed")])
+def test_a_line_is_refused_whole_and_for_its_reason(line: bytes, reason: str) -> None:
+    assert refusal(line) == reason
+    assert independent(line) is None
+
+
+@each("letters", ["".join(letters) for letters in itertools.product("abcd", repeat=4)])
+def test_the_wheels_may_come_in_any_order_but_each_exactly_once(letters: str) -> None:
+    line = b",".join(SEED_LINE.split(b",")["abcd".index(letter)] for letter in letters)
+    if len(set(letters)) == 4:
+        assert CODEC.decode(line) == SEED_SPEEDS
+    else:
+        assert refusal(line) == "duplicate_wheel"
+
+
+@law
+@given(wiring=wirings, motors=st.tuples(*[st.floats(0.0, 99.0)] * 4))
+def test_motor_values_map_to_wheels_in_the_same_way_as_a_line(
+    wiring: WheelMap, motors: Motors
+) -> None:
+    a, b, c, d = (round(motor, 2) for motor in motors)
+    line = f"ap{a:05.2f},bp{b:05.2f},cp{c:05.2f},dp{d:05.2f}".encode()
+    codec = Codec(wiring)
+    assert codec.decode(line).as_tuple() == codec.wheels((a, b, c, d))
+
+
+# damage
+
+
+def independent(line: bytes) -> Motors | None:
+    """Parse a line with code that shares nothing with acsard; None if it is not well-formed."""
+    tokens = line.split(b",")
+    if len(tokens) == 5 and not tokens[4].strip(b" "):
+        tokens.pop()
+    if len(tokens) != 4:
+        return None
+    values: dict[int, float] = {}
+    for number, token in enumerate(tokens):
+        if number:
+            token = token.lstrip(b" ")
+        whole, point, decimals = token[2:].partition(b".")
+        digits = whole + decimals
+        if len(token) < 5 or not point or any(byte not in b"0123456789" for byte in digits):
+            return None
+        if not 1 <= len(whole) <= 2 or not 1 <= len(decimals) <= 3:
+            return None
+        thousandths = int(whole) * 1000 + int(decimals.ljust(3, b"0"))
+        if token[0] not in b"abcd" or token[1] not in b"pn" or thousandths > 99_990:
+            return None
+        values[token[0]] = (thousandths if token[1] == ord("p") else -thousandths) / 1000
+    return (values[97], values[98], values[99], values[100]) if len(values) == 4 else None
+
+
+def valid(dice: random.Random) -> bytes:
+    """Return a random well-formed line in one of the accepted forms."""
+    letters = "abcd" if dice.random() < 0.9 else "".join(dice.sample("abcd", 4))
+    form = dice.choice(("%05.2f", "%05.2f", "%05.2f", "%.2f", "%.3f"))
+    tokens = []
+    for letter in letters:
+        speed = dice.choice((0.0, 9.99, 99.99, *[dice.random() * 99.9] * 9))
+        tokens.append(f"{letter}{dice.choice('pn')}{form % speed}")
+    return (dice.choice((",", ",", ", ")).join(tokens) + dice.choice(("", "", "", ","))).encode()
+
+
+def damaged(dice: random.Random, line: bytes, other: bytes) -> bytes:
+    """Return `line` as a bad wire might deliver it."""
+    place = dice.randrange(len(line))
+    before, after = line[:place], line[place:]
+    match dice.randrange(8):
+        case 0:  # the start or the end is missing
+            return after if dice.random() < 0.5 else before
+        case 1:  # some bytes are missing inside
+            return before + after[dice.randint(1, 9) :]
+        case 2:  # the line runs into the next one, whole or in part
+            return line + dice.choice((b"", b",", b"\r", other)) + other[dice.randrange(30) :]
+        case 3:  # the rest is another line's
+            return before + other[place:]
+        case 4:  # the rest is another line's, shifted
+            return before + other[dice.randrange(len(other)) :]
+        case 5:  # one additional byte
+            return before + dice.randbytes(1) + after
+        case 6:  # a wrong byte of the most harmful kind
+            return before + bytes([dice.choice(b"abcdpn0123456789.,- \r\x00")]) + after[1:]
+        case _:  # flipped bits
+            broken = bytearray(line)
+            for _ in range(dice.randint(1, 2)):
+                broken[dice.randrange(len(broken))] ^= 1 << dice.randrange(8)
+            return bytes(broken)
+
+
+def wire(dice: random.Random, count: int) -> Iterator[bytes]:
+    """Yield `count` lines in random pieces. One in five lines is undamaged."""
+    other, buffer = valid(dice), b""
+    for _ in range(count):
+        line = valid(dice)
+        buffer += line if dice.random() < 0.2 else damaged(dice, line, other)
+        buffer += dice.choice((b"\r\n", b"\r\n", b"\n"))
+        other, cut = line, dice.randrange(len(buffer) + 1)
+        yield buffer[:cut]
+        buffer = buffer[cut:]
+    yield buffer
+
+
+SOAK = pytest.param(1_000_000, marks=[pytest.mark.soak, pytest.mark.timeout(900)])
+
+
+@pytest.mark.parametrize("count", [6000, SOAK])
+def test_a_damaged_line_is_rejected_whole_or_is_itself_a_well_formed_line(count: int) -> None:
+    reader, tally = LineReader(), Counter[str]()
+    for piece in wire(random.Random(20_240_229), count):
+        for line, _ in reader.feed(piece):
+            found = independent(line)
+            if found is None:
+                tally[refusal(line)] += 1
+            else:
+                assert CODEC.decode(line).as_tuple() == found, line
+                tally["read"] += 1
+    assert sum(tally.values()) > 0.95 * count
+    assert set(tally) == {"read", "malformed", "duplicate_wheel", "over_range"}
+
+
+# lines from bytes, however these are cut
+
+pieces = st.one_of(
+    st.sampled_from([SEED_LINE + b"\r\n", SEED_REPLY + b"\n", ZERO + b"\r\n"]),
+    st.sampled_from([b"\n", b"\r\n", b"\r", b"\r\r\n", b"a\rb\r\n", SEED_LINE[:17], b"\x00\xff"]),
+    st.integers(MAX_LINE_BYTES - 3, 3 * MAX_LINE_BYTES).map(lambda n: b"x" * n),
+    st.binary(max_size=40),
+)
+"""Anything that a wire may carry: lines, line ends, halves, runs near the maximum length, noise."""
+
+
+def feed(reader: LineReader, *chunks: bytes) -> list[bytes]:
+    return [line for chunk in chunks for line, _ in reader.feed(chunk)]
+
+
+@law
+@given(st.lists(pieces, max_size=12).map(b"".join), st.sets(st.integers(0, 500)))
+def test_the_lines_are_the_text_split_at_newlines_wherever_it_is_cut(
+    data: bytes, places: set[int]
+) -> None:
+    *ended, _ = (data + b"\n").split(b"\n")
+    whole = [line for line in ended if len(line) + 1 <= MAX_LINE_BYTES]
+    expected = [line.removesuffix(b"\r") for line in whole if line not in (b"", b"\r")]
+    ends = [place for place in sorted(places) if place <= len(data)]
+    cut = [data[a:b] for a, b in zip([0, *ends], [*ends, len(data)], strict=True)]
+    for chunks in (cut, [data[i : i + 1] for i in range(len(data))]):
+        reader, found, before = LineReader(), list[bytes](), b""
+        for chunk in (*chunks, b"\n"):
+            for line, following in reader.feed(chunk):
+                upto = before + chunk[: len(chunk) - following]
+                assert upto.endswith((line + b"\r\n", line + b"\n"))
+                found.append(line)
+            before += chunk
+        assert found == expected
+        assert reader.too_long == len(ended) - len(whole)
+
+
+@each("length", [1, 7, 127, 128, 129, 1000])
+def test_after_an_over_long_line_the_next_newline_resynchronises(length: int) -> None:
+    reader, noise = LineReader(), b"x" * 1000
+    chunks = [noise[i : i + length] for i in range(0, 1000, length)]
+    assert feed(reader, *chunks, SEED_LINE + b"\r\n", SEED_REPLY + b"\r\n") == [SEED_REPLY]
+    assert reader.too_long == 1
+    assert feed(reader, b"x" * 127 + b"\n", b"x" * 126 + b"\r\n") == [b"x" * 127, b"x" * 126]
+    assert feed(reader, b"x" * 128 + b"\n", b"x" * 127 + b"\r\n") == []
+
+
+def test_noise_without_newline_is_counted_once_and_never_grows_memory() -> None:
+    reader = LineReader()
+    for size in (1, 100, 127, 128, 10_000, 1_000_000) * 10:
+        assert reader.feed(b"\xff" * size) == []
+        assert len(msgspec.msgpack.encode(reader)) < MAX_LINE_BYTES + 64
+    assert reader.too_long == 1
+
+
+@each("before", [SEED_LINE[:10], b"x" * 500])
+def test_clear_forgets_half_a_line_and_ends_the_discarding(before: bytes) -> None:
+    reader = LineReader()
+    reader.feed(before)
+    reader.clear()
+    assert feed(reader, SEED_LINE + b"\n") == [SEED_LINE]
+    assert reader.too_long == (len(before) > 128)

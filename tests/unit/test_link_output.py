@@ -1,0 +1,273 @@
+"""What goes to the board: a line at once or not at all, stops in a silence, when they left."""
+
+from __future__ import annotations
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from msgspec.structs import replace
+
+from acsard.core.config.settings import McuConfig, WheelMap
+from acsard.core.config.wire_time import wire_ns
+from acsard.core.link.checked_line import SAMPLE_REQUEST, seal
+from acsard.core.link.link_state import GOOD_LINES
+from acsard.core.link.serial_output import SerialOutput
+from acsard.core.values import STILL, WheelSpeeds
+from tests.each import each
+from tests.unit.link_bench import CHECKED, GOOD, MS, PLAIN, SLOW, STOP, LinkBench
+from tests.vectors.lines import ZERO
+
+COMMA_STOP = STOP[:-2] + b",\r\n"
+GO = b"ap10.00,bp10.00,cp10.00,dp10.00\r\n"
+
+
+class Wire:
+    """A serial output, and a kernel that accepts only a part of each line."""
+
+    def __init__(self, baud_rate: int = 115200, stop: bytes = STOP, period_ms: int = 10) -> None:
+        self.gate, self.stop = SerialOutput(baud_rate, stop, period_ms * MS), stop
+        self.out = b""
+
+    def offer(
+        self,
+        line: bytes,
+        at_ms: float,
+        made_ms: float | None = None,
+        kernel: int = 0,
+        takes: int = 99,
+    ) -> str:
+        now_ns, made_ns = int(at_ms * MS), int((at_ms if made_ms is None else made_ms) * MS)
+        data = self.gate.prepare(line, made_ns, now_ns, kernel)
+        if data is None:
+            return "superseded"
+        size = min(takes, len(data))
+        self.out += data[:size]
+        return self.gate.record_write(line, data, size, now_ns)
+
+    def started(self) -> Wire:
+        assert self.offer(self.stop, 0) == "sent"
+        self.out = b""
+        return self
+
+
+@each("line", [GO, seal(STOP, 7)])
+def test_an_opening_begins_with_a_line_end_and_the_plain_stop(line: bytes) -> None:
+    wire = Wire()
+    assert wire.offer(line, 1000, made_ms=100, takes=20) == "superseded"
+    wire.out = b""  # after an incomplete one it is sent again
+    assert wire.offer(line, 1010) == "superseded"
+    assert wire.out == b"\r\n" + STOP
+    assert wire.offer(GO, 1020) == "sent"
+    assert wire.out == b"\r\n" + STOP + GO
+
+
+def test_a_line_waits_until_the_previous_one_has_left_wire_and_kernel() -> None:
+    wire = Wire(9600)
+    wire.offer(STOP, 5)  # 35 bytes at 9600 baud take 36.458 ms
+    assert wire.offer(GO, 5 + 36.458) == "superseded"
+    assert wire.offer(GO, 5 + 36.459) == "sent"
+    for line in (GO, STOP):
+        assert wire.offer(line, 1000, kernel=1) == "superseded"
+    assert wire.offer(GO, 1000) == "sent"
+    # Only the bytes that were taken count: 12 bytes take 12.5 ms.
+    wire.offer(GO, 1100, takes=12)
+    assert wire.gate.sent_ns == 1100 * MS
+    assert wire.offer(GO, 1112.4) == "superseded"
+    assert wire.offer(GO, 1112.5, takes=0) == "superseded"
+    assert wire.gate.sent_ns == 1100 * MS
+    assert wire.offer(GO, 1112.5) == "sent"
+
+
+@each("period_ms", [4, 10, 100])
+def test_a_line_older_than_a_period_is_not_sent(period_ms: int) -> None:
+    wire = Wire(period_ms=period_ms).started()
+    for line in (GO, seal(GO, 7, SAMPLE_REQUEST), b"ap00.00,bp00.00,cp00.00,dp00.01\r\n"):
+        assert wire.offer(line, 100 + period_ms + 0.001, made_ms=100) == "superseded"
+    assert wire.offer(GO, 300 + period_ms, made_ms=300) == "sent"
+
+
+@each("letters", [None, b"", SAMPLE_REQUEST])
+@each("stop", [STOP, COMMA_STOP])
+def test_a_stop_of_any_form_is_never_too_old(stop: bytes, letters: bytes | None) -> None:
+    line = stop if letters is None else seal(stop, 7, letters)
+    wire = Wire(stop=stop).started()
+    assert wire.offer(line, 1000, made_ms=100) == "sent"
+    assert wire.out == line
+
+
+@each(("takes", "prefix"), [(33, b""), (32, b"\r\n"), (0, b"")])
+def test_a_line_begins_with_a_line_end_only_after_a_torn_line(takes: int, prefix: bytes) -> None:
+    wire = Wire().started()
+    assert wire.offer(GO, 10, takes=takes) == ("sent" if takes == 33 else "superseded")
+    wire.out = b""
+    assert wire.offer(GO, 20) == "sent"
+    assert wire.out == prefix + GO
+
+
+@settings(max_examples=100)
+@given(
+    baud=st.sampled_from([9600, 19200, 38400, 57600, 115200]),
+    sends=st.lists(st.tuples(st.integers(0, 50 * MS), st.integers(0, 35)), min_size=1),
+)
+def test_no_bytes_ever_queue_on_the_wire(baud: int, sends: list[tuple[int, int]]) -> None:
+    gate, now_ns, busy_until_ns = SerialOutput(baud, STOP, 10 * MS), 0, 0
+    for pause_ns, takes in sends:
+        now_ns += pause_ns
+        data = gate.prepare(GO, now_ns, now_ns, 0)
+        if data is not None:
+            assert now_ns >= busy_until_ns
+            size = min(takes, len(data))
+            gate.record_write(GO, data, size, now_ns)
+            busy_until_ns = now_ns + size * 10 * 1_000_000_000 // baud
+
+
+# which line is made
+
+
+@each("mcu", [PLAIN, CHECKED])
+def test_a_session_begins_with_a_plain_stop_and_the_question_follows_the_first_line(
+    mcu: McuConfig,
+) -> None:
+    bench = LinkBench(mcu).open()
+    bench.wait(10)
+    lines = [bench.line()]
+    for _ in range(50):
+        bench.wait(10)
+        lines.append(bench.line())
+    assert set(lines) <= {None, STOP, *[seal(ZERO, n) for n in range(9)]}
+    assert lines[0] == STOP
+    bench.wait(10, STOP)
+    assert bench.line() == b"?\r\n"
+    bench.update(False)
+    assert bench.line() == b"?\r\n"  # until it has left
+    bench.update(True)
+    assert bench.line() != b"?\r\n"
+
+
+def test_a_silent_board_gets_a_stop_without_delay_and_then_ten_a_second() -> None:
+    bench = LinkBench().up()
+    assert bench.line(STILL) == STOP
+    while not bench.session.silent(bench.now_ns):
+        assert bench.line() == b"ap01.00,bp01.00,cp01.00,dp01.00\r\n"
+        bench.wait(10)
+    assert bench.line() == STOP
+    lines = []
+    for _ in range(100):
+        bench.wait(10)
+        lines.append(bench.line())
+    assert [line for line in lines if line] == [STOP] * 10
+    # A board that reports by its own clock gets no more time behind a late step: its lines would
+    # wait in the kernel.
+    free = LinkBench(McuConfig(reply_period=0.02)).up()
+    free.wait(150)
+    assert free.link == "stale"
+
+
+def test_a_closed_port_is_offered_ten_stops_a_second_and_one_when_it_opens() -> None:
+    bench = LinkBench()
+    made = []
+    for _ in range(100):
+        bench.update(False)
+        made.append(bench.line())
+    assert len([line for line in made if line]) == 10
+    bench.open().update(False)
+    assert bench.line() == STOP
+    bench.update(False)
+    assert bench.line() == STOP  # it was not sent
+    bench.update(True)
+    assert bench.line() is None
+
+
+# a blocked output
+
+
+def blocked(ms: float) -> LinkBench:
+    """Return a session whose port sent no line for this time, although good lines arrived."""
+    bench = LinkBench().up()
+    bench.line()
+    bench.update(True, 10, GOOD)
+    for _ in range(round(ms / 10)):
+        bench.line()
+        bench.update(False, 10, GOOD)
+    return bench
+
+
+def test_an_output_that_is_blocked_for_the_watchdog_time_makes_the_link_stale() -> None:
+    bench = blocked(290)
+    assert (bench.link, bench.session.blocked) == ("up", False)
+    bench.line()
+    bench.update(False, 20, GOOD)
+    assert (bench.link, bench.session.blocked, bench.names) == ("stale", True, ["link_stale"])
+    assert bench.why.code == bench.session.events[0].code == "port_blocked"
+    bench.close().wait(10)
+    assert not bench.session.blocked
+    late = LinkBench().up()  # a late step is no block
+    late.line()
+    late.update(False, 400, GOOD)
+    late.line()
+    late.update(True, 10, GOOD)
+    assert not late.session.blocked
+
+
+@each(("ms", "restarted"), [(900, False), (1010, True)])
+def test_a_sent_line_ends_the_block_and_a_block_of_a_second_restarts_the_session(
+    ms: float, restarted: bool
+) -> None:
+    bench = blocked(ms)
+    bench.line()
+    bench.update(True, 10, GOOD)
+    assert (bench.session.blocked, bench.session.restarted) == (False, restarted)
+    for _ in range(GOOD_LINES):
+        bench.line()
+        bench.update(True, 10, GOOD)
+    assert bench.link == "up"
+
+
+# when rest was commanded
+
+FREE = McuConfig(reply_period=0.01)
+WIRED = replace(FREE, wheels=WheelMap("-d", "+c", "-b", "+a"))
+WIRE_MS = wire_ns(len(GOOD), 115200) / MS
+
+
+def driven_ms(bench: LinkBench, *lines: tuple[WheelSpeeds, float]) -> object:
+    """Write these lines, let the given time in ms pass after each, and then receive a good line.
+
+    Returns the time from the last sample before these lines to the command to rest, ms.
+    """
+    for speeds, ms in lines:
+        bench.line(speeds)
+        bench.wait(ms)
+    (feedback,) = bench.wait(0, GOOD)
+    return pytest.approx(1000 * feedback.driven - WIRE_MS)
+
+
+@each("mcu", [FREE, replace(FREE, trailing_comma=True), WIRED])
+def test_a_line_tells_when_rest_was_commanded_after_the_last_motion(mcu: McuConfig) -> None:
+    moves, rests = (SLOW, 10.0), (STILL, 10.0)
+    bench = LinkBench(mcu).up()
+    assert driven_ms(bench, moves, moves, rests, rests) == 20
+    assert driven_ms(bench, rests, rests) == -20  # before that line
+    assert driven_ms(bench, moves, rests, moves, rests) == 30
+
+
+def test_behind_a_stall_the_watchdog_has_stopped_the_motors_before_the_zeros() -> None:
+    bench = LinkBench(FREE, rate_hz=20.0).up()
+    assert driven_ms(bench, (SLOW, 10), (SLOW, 190), (STILL, 10)) == 200
+    assert driven_ms(bench, (SLOW, 10), (SLOW, 500), (STILL, 10), (STILL, 10)) == 310
+
+
+def test_zeros_that_did_not_leave_command_no_rest_and_checked_ones_do() -> None:
+    bench = LinkBench(FREE).up()
+    bench.line(SLOW)
+    bench.wait(10)
+    for left in (False, True):
+        bench.line(STILL)
+        bench.update(left)
+    assert driven_ms(bench) == 20
+    bench = LinkBench(CHECKED).checked()
+    bench.line(SLOW)
+    bench.wait(10)
+    answer = bench.answer(bench.line(STILL))
+    (feedback,) = bench.wait(10, answer)
+    assert 1000 * feedback.driven == pytest.approx(10 + wire_ns(len(answer), 115200) / MS)

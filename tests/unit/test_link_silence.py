@@ -1,0 +1,214 @@
+"""Why a link is down: what the board sent instead, or a delay of this computer."""
+
+from __future__ import annotations
+
+from acsard.core.config.settings import McuConfig
+from acsard.core.link.lines import LineReader
+from acsard.core.link.link_diagnosis import (
+    FIRST_DIAGNOSIS_NS,
+    MAX_UNANSWERED_FRACTION,
+    WINDOW_LINES,
+    Heard,
+    Lateness,
+    SilenceDiagnosis,
+    UnansweredLines,
+)
+from acsard.core.link.link_setup import LinkSetup
+from tests.each import each
+from tests.unit.link_bench import GOOD, MS, STOP, LinkBench
+
+BOARD = McuConfig(port="/dev/board")
+SIMULATED, REAL = (LinkSetup.of(McuConfig(port=port), 100.0) for port in ("sim", "/dev/board"))
+
+HEARD: dict[str, tuple[bytes, str, str]] = {
+    "mute": (b"", "nothing", "nothing was received"),
+    "half lines": (
+        b"ap00.00,bp00.00,c" * 9,
+        "cut",
+        "153 bytes received but no line end; the last bytes are `",
+    ),
+    "cut lines": (b"ap00.00,bp0\r\n" * 4, "cut", "none good, the last one is `ap00.00,bp0`"),
+    "noise": (
+        (b"\x00\xff~" + STOP) * 144,
+        "foreign",
+        r"lines received, none good, the last one is `\x00\xff~ap00.00,bp00.00,cp00.00,dp00.00`",
+    ),
+    "wrong baud rate": (b"\xf8\x00\xe6\n\x9e" * 3, "garbage", "3 lines received, none good"),
+    "no end": (
+        b"\xf8\x00\xe6" * 3, "garbage", r"the last bytes are `\xf8\x00\xe6\xf8\x00\xe6\xf8\x00\xe6`"
+    ),
+    "some good": (
+        STOP + b"ap?\r\n", "few", "2 lines received, only 1 good, the last bad one is `ap?`"
+    ),
+    "all good": (STOP * 2, "sparse", "2 lines received, all of them good, but too few for a link"),
+}  # fmt: skip
+
+
+@each(("data", "looks", "counted"), list(HEARD.values()))
+def test_the_diagnosis_says_what_was_received_and_how_it_looks(
+    data: bytes, looks: str, counted: str
+) -> None:
+    heard = Heard()
+    heard.take(data)
+    for line, _ in LineReader().feed(data):
+        heard.line(line, line + b"\r\n" == STOP)
+    assert heard.code == heard.diagnosis().code == f"received_{looks}"
+    assert counted in heard.counted
+    assert heard.counted in heard.diagnosis().text
+
+
+def test_it_comes_after_three_seconds_and_again_only_when_it_changes() -> None:
+    hearing, reports = SilenceDiagnosis(), []
+    for tick in range(100):
+        if tick > 50:
+            hearing.now.take(b"\x00")
+        if hearing.judge(tick * FIRST_DIAGNOSIS_NS // 10):
+            assert hearing.heard is not None
+            reports.append((tick, hearing.heard.code))
+    assert reports == [(10, "received_nothing"), (60, "received_garbage")]
+    hearing.now.line(STOP, good=True)
+    hearing.forget()
+    assert (hearing.heard, hearing.now) == (None, Heard())
+    assert not hearing.judge(10 * FIRST_DIAGNOSIS_NS)
+
+
+def test_noise_or_silence_is_the_reason_of_the_link() -> None:
+    bench, codes = LinkBench().open(), []
+    for tick in range(400):
+        bench.wait(10, *([b"\x00\xff~" + GOOD] if tick % 2 else []))
+        codes += [event.code for event in bench.session.events if event.name == "link_booting"]
+    assert codes.count("received_foreign") == 1
+    found = [bench.why.code]
+    bench.wait(10, GOOD * 3)
+    found.append(bench.why.code)
+    for steps in (20, 302):
+        bench.waits(steps)
+        found.append(bench.why.code)
+    assert found == ["received_foreign", "link_up", "simulator_fault", "received_nothing"]
+
+
+@each(
+    ("apart", "longest", "code"),
+    [
+        (20, 0.25, "reply_period"),
+        (20, 0.15, "lines_too_rare"),
+        (74, 0.25, "lines_too_rare"),
+        (136, 0.25, "lines_too_rare"),
+    ],
+)
+def test_lines_too_far_apart_are_reported_with_a_setting_only_if_it_is_valid(
+    apart: int, longest: float, code: str
+) -> None:
+    bench = LinkBench(BOARD, longest_reply=longest).open()
+    for tick in range(600):
+        bench.wait(10, *([] if tick % apart else [GOOD]))
+    assert bench.why.code == code
+    bench = LinkBench(BOARD).up()  # a single silence proves nothing
+    bench.waits(20)
+    bench.wait(10, GOOD)
+    assert (bench.link, bench.why.code) == ("stale", "link_silent")
+
+
+# delays of this computer
+
+
+def after(*steps_ms: int, good: bool = False, setup: LinkSetup = REAL) -> Lateness:
+    """Check the lateness after each of these time steps. A good line arrives at time 0.
+
+    `good` says whether another good line arrives in the last step.
+    """
+    lateness, now_ns = Lateness(), 0
+    lateness.record_step(setup, now_ns, good=True)
+    for number, step_ms in enumerate(steps_ms, 1):
+        now_ns += step_ms * MS
+        lateness.record_step(setup, now_ns, good=good and number == len(steps_ms))
+    return lateness
+
+
+@each(
+    ("lateness", "late_s", "code"),
+    [
+        (after(*[10] * 11), 0.0, "link_silent"),
+        (after(*[49] * 3), 0.0, "link_silent"),
+        (after(800), 0.8, "host_late"),
+        (after(10, 800, 10), 0.8, "host_late"),
+        (after(60, 800), 0.8, "host_late"),
+        (after(800, 10, good=True), 0.0, "link_silent"),
+        (after(800, good=True), 0.0, "link_silent"),
+    ],
+)
+def test_a_stale_link_is_blamed_on_the_board_unless_the_host_was_late(
+    lateness: Lateness, late_s: float, code: str
+) -> None:
+    assert (lateness.late_s, lateness.describe(REAL, "stale").code) == (late_s, code)
+    assert [lateness.describe(REAL, state).code for state in ("up", "booting", "down")] == [
+        "link_up", "booting", "port_closed",
+    ]  # fmt: skip
+
+
+def test_a_late_simulator_is_not_reported_as_a_silent_board() -> None:
+    for steps, code in (((10, 10), "simulator_fault"), ((800,), "host_late")):
+        assert after(*steps, setup=SIMULATED).describe(SIMULATED, "stale").code == code
+
+
+@each(("port", "code"), [("sim", "simulator_fault"), ("/dev/board", "link_silent")])
+def test_lines_that_the_host_read_late_give_no_advice_about_the_board(port: str, code: str) -> None:
+    bench, codes = LinkBench(McuConfig(port=port)).up(), set()
+    for _ in range(20):  # a step late, which finds the bytes that arrived meanwhile
+        bench.wait(300)
+        codes.add(bench.why.code)
+        bench.wait(10, GOOD)
+        codes.add(bench.why.code)
+    assert codes == {"host_late", code}
+
+
+def sparse(bench: LinkBench) -> str:
+    """Return the first diagnosis of a board that sends three good lines and then nothing."""
+    for tick in range(3 * 100 + 2):
+        bench.wait(10, *([GOOD] if tick % 20 == 1 and tick < 50 else []))
+    heard = bench.session._hearing.heard
+    assert heard is not None
+    assert heard.code == "received_sparse"
+    return heard.diagnosis().code
+
+
+def test_only_a_stall_within_the_time_of_sparse_lines_explains_them() -> None:
+    bench = LinkBench(BOARD).up()
+    bench.wait(2000, GOOD * 3)
+    assert bench.waits(400, GOOD) == "up"
+    assert bench.waits(11) == "stale"
+    assert sparse(bench) == "received_sparse"
+    bench = LinkBench(BOARD).up().close()  # nor is a closed port a stall
+    bench.waits(400)
+    assert sparse(bench.open()) == "received_sparse"
+    bench = LinkBench(BOARD).open()
+    bench.wait(10)
+    bench.wait(800)
+    assert sparse(bench) == "host_late"
+
+
+# lines without an answer
+
+
+def events_of(every: int, windows: int = 3, period: float = 0.0, linked: bool = True) -> list[str]:
+    """Return the events of a link that loses every n-th line."""
+    answered = UnansweredLines()
+    events = [
+        answered.check(sent, sent - sent // every if every else sent, linked, period)
+        for sent in range(windows * WINDOW_LINES + 1)
+    ]
+    return [event.text for event in events if event is not None]
+
+
+def test_a_loss_of_a_fifth_of_the_lines_is_reported_once_with_its_figures() -> None:
+    (text,) = events_of(5)
+    assert f"answered only {WINDOW_LINES * 4 // 5} of {WINDOW_LINES} lines" in text
+    assert events_of(0) == events_of(int(1 / MAX_UNANSWERED_FRACTION) + 1) == []
+    # Not for a free-running board or without a link, and again after the link was down.
+    assert events_of(5, period=0.1) == events_of(5, linked=False) == []
+    answered = UnansweredLines()
+    events = [
+        answered.check(sent, sent // 2, sent != WINDOW_LINES + 10, 0.0)
+        for sent in range(3 * WINDOW_LINES)
+    ]
+    assert len([event for event in events if event]) == 2

@@ -1,0 +1,295 @@
+"""The pose by odometry: the path, counts, gaps, skipped lines, and a robot at rest."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from acsard.core.link.feedback import Feedback
+from acsard.core.motion.gaps import AT_REST, LONG_S, Rolled, Skipped, rolled_over
+from acsard.core.motion.gyro import Gyro, Turn
+from acsard.core.values import Estimate, Instant, Pose, Twist, WheelSpeeds
+from tests.each import each
+from tests.unit.odometer import Odometer, arc
+from tests.vectors.drive import PATHS, SEED_STEP, SEED_STEP_ARC, SEED_STEP_TWIST
+
+law = settings(max_examples=100)
+AT = Instant(5_000_000_000, 1_800_000_000_000_000_000)
+Three = tuple[float, float, float]
+wheel_speed = st.floats(-40.0, 40.0)
+moves = st.lists(st.tuples(wheel_speed, wheel_speed, st.floats(0.0, 0.1)), max_size=30)
+"""Moves as left and right (rad/s) and dt (s)."""
+
+
+def feedback(left: float, right: float, dt: float, **more: Any) -> Feedback:
+    return Feedback(AT, WheelSpeeds(right, left, left, right), dt, **more)
+
+
+def line(speed: float, dt: float = 0.01, **more: Any) -> Feedback:
+    return feedback(speed, speed, dt, **more)
+
+
+def counts(*turned: float, speed: float = 0.0, dt: float = 0.01, gap: float = 0.0) -> Feedback:
+    """Return a line whose wheels turned by these angles, rad. A single number is for all wheels."""
+    return line(speed, dt, gap=gap, turned=turned if len(turned) == 4 else turned * 4)
+
+
+def same_pose(pose: Pose, expected: Three, tolerance: float = 1e-9) -> bool:
+    """Return whether poses are equal within `tolerance`, ignoring whole turns of yaw."""
+    turn = math.remainder(pose.yaw - expected[2], math.tau)
+    return (pose.x, pose.y, turn) == pytest.approx((*expected[:2], 0.0), abs=tolerance)
+
+
+# the path
+
+
+@each("steps", [1, 2, 10, 314])
+@each("path", PATHS)
+def test_a_path_ends_where_geometry_says_in_however_many_steps(path: Any, steps: int) -> None:
+    robot, (_, left, right, seconds, pose) = Odometer(), path
+    for _ in range(steps):
+        robot.fold(feedback(left, right, seconds / steps))
+    assert same_pose(robot.pose, pose)
+
+
+def test_a_step_has_the_twist_of_the_seed_equations_and_ends_on_the_arc() -> None:
+    estimate = Odometer().fold(feedback(*SEED_STEP))
+    assert (estimate.twist.linear, estimate.twist.angular) == pytest.approx(SEED_STEP_TWIST)
+    assert same_pose(estimate.pose, SEED_STEP_ARC, tolerance=1e-10)
+
+
+@each("turn", [0.0, 5e-324, 1e-300, 1e-20, 1e-12, 1e-9, -1e-9])
+def test_an_arc_of_hardly_any_turn_is_a_straight_line(turn: float) -> None:
+    assert same_pose(arc(Pose(), 1.0, turn), (1.0, 0.0, turn))
+
+
+@law
+@given(path=moves)
+def test_there_and_back_the_same_way_ends_where_it_began(path: list[Three]) -> None:
+    robot = Odometer()
+    for left, right, dt in path:
+        robot.fold(feedback(left, right, dt))
+    for left, right, dt in reversed(path):
+        robot.fold(feedback(-left, -right, dt))
+    assert same_pose(robot.pose, (0.0, 0.0, 0.0))
+    assert robot.fold(line(0.0, 0.0)).positions == pytest.approx((0.0,) * 4, abs=1e-9)
+
+
+@law
+@given(turns=st.lists(st.floats(-1000.0, 1000.0), max_size=50))
+def test_yaw_stays_within_half_a_turn(turns: list[float]) -> None:
+    robot = Odometer()  # turning in place at 3 rad/s gives a yaw rate of 1 rad/s
+    for turn in turns:
+        assert abs(robot.fold(feedback(-3.0 * turn, 3.0 * turn, 1.0)).pose.yaw) <= math.pi
+    assert same_pose(robot.pose, (0.0, 0.0, sum(turns)), 1e-8)
+
+
+def test_each_wheel_turns_by_its_own_speed() -> None:
+    robot = Odometer()
+    robot.fold(Feedback(AT, WheelSpeeds(1.0, 2.0, -3.0, 4.0), 0.05))
+    estimate = robot.fold(Feedback(AT, WheelSpeeds(1.0, 0.0, -1.0, 0.0), 0.025))
+    assert estimate.positions == pytest.approx((0.075, 0.1, -0.175, 0.2))
+    assert (estimate.at, estimate.speeds) == (AT, WheelSpeeds(1.0, 0.0, -1.0, 0.0))
+    odometry = robot.odometry
+    now = (estimate.twist, estimate.speeds, estimate.pose)
+    assert (odometry.twist, odometry.speeds, odometry.pose) == now
+
+
+def test_the_first_line_and_a_gap_move_nothing() -> None:
+    robot = Odometer()
+    estimate = robot.fold(line(10.0, 0.0))
+    assert (estimate.pose, estimate.positions) == (Pose(), (0.0,) * 4)
+    before = robot.fold(line(10.0, 0.1))
+    after = robot.fold(line(10.0, 0.0, gap=5.0))
+    assert (after.pose, after.positions) == (before.pose, before.positions)
+
+
+def test_setting_the_pose_wraps_its_yaw() -> None:
+    robot = Odometer()
+    robot.set_pose(Pose(1.0, 2.0, 7.0))
+    assert robot.pose == Pose(1.0, 2.0, 7.0 - math.tau)
+
+
+# counts
+
+
+def test_counts_move_the_robot_whatever_the_speed_and_duration_of_the_line() -> None:
+    estimate = Odometer().fold(counts(2.0, dt=99.0, speed=50.0))
+    assert same_pose(estimate.pose, (0.1, 0.0, 0.0))
+    assert estimate.positions == (2.0,) * 4
+    assert estimate.twist.linear == pytest.approx(2.5)
+
+
+@law
+@given(path=moves)
+def test_counts_that_agree_with_the_speeds_make_the_same_path(path: list[Three]) -> None:
+    by_speed, by_counts = Odometer(), Odometer()
+    for robot in (by_speed, by_counts):
+        robot.fold(line(9.0, 0.0))
+    for left, right, dt in path:
+        by_speed.fold(feedback(left, right, dt))
+        by_counts.fold(counts(right * dt, left * dt, left * dt, right * dt))
+    pose = by_speed.pose
+    assert same_pose(by_counts.pose, (pose.x, pose.y, pose.yaw))
+
+
+def test_counts_over_a_gap_add_no_uncertainty_of_the_gap() -> None:
+    by_gap, at_once = Odometer(), Odometer()
+    by_gap.fold(counts(0.0, speed=10.0))
+    bridged = by_gap.fold(counts(5.0, dt=0.0, gap=0.5, speed=10.0))
+    whole = at_once.fold(counts(5.0, speed=10.0))
+    assert same_pose(bridged.pose, (whole.pose.x, whole.pose.y, whole.pose.yaw))
+    assert bridged.covariance == whole.covariance
+
+
+@each("after", [counts(1.0), line(20.0, 0.05)])
+def test_the_counts_of_skipped_lines_are_not_lost(after: Feedback) -> None:
+    robot = Odometer()
+    for _ in range(10):
+        robot.skip(counts(1.0, speed=99.0))
+    assert robot.fold(after).pose.x == pytest.approx(0.05 * 11)
+    assert robot.fold(counts(0.0)).positions == pytest.approx((11.0,) * 4)
+
+
+def test_the_whole_counts_of_a_line_give_its_distance_whatever_its_speed_and_time() -> None:
+    robot = Odometer()
+    for dt in (0.01, 0.003, 0.017):
+        robot.fold(line(9.99, dt, counted=(0.1,) * 4))
+    assert robot.pose.x == pytest.approx(3 * 0.1 * 0.05)
+
+
+# gaps and skipped lines
+
+
+def roll(feedback: Feedback, *skipped: Feedback) -> Rolled:
+    """Return how far a line rolls whose wheels turned at 10 rad/s before it."""
+    before = Skipped()
+    for one in skipped:
+        before.add(one)
+    return rolled_over(before, feedback, (10.0,) * 4)
+
+
+@each(
+    ("rolled", "angle", "seconds", "filled", "unknown"),
+    [
+        # A gap has the mean of the speeds at its ends. Counts need no filling; whole counts are of
+        # the line alone.
+        (roll(line(20.0, 0.31, bridged=0.3)), 15 * 0.3 + 20 * 0.01, 0.31, 0.3, 0.0),
+        (roll(line(20.0, 0.31, bridged=0.3, turned=(7.0,) * 4)), 7.0, 0.31, 0.0, 0.0),
+        (roll(line(20.0, 0.31, bridged=0.3, counted=(0.1,) * 4)), 15 * 0.3 + 0.1, 0.31, 0.3, 0.0),
+        # Skipped lines leave their time and their counts to the next one, but not for a second.
+        (
+            roll(line(20.0), line(99.0, turned=(1.0,) * 4), line(99.0, 0.02)),
+            1.0 + 15.0 * 0.02 + 20.0 * 0.01, 0.04, 0.02, 0.0,
+        ),
+        (roll(line(20.0), line(9.0, 0.0, gap=0.5), *[line(9.0)] * 101), 0.2, 0.01, 0.0, 1.51),
+        (roll(line(20.0), line(9.0, counted=(5.0,) * 4)), 0.15 + 0.2, 0.02, 0.01, 0.0),
+    ],
+)  # fmt: skip
+def test_how_far_a_line_rolls(
+    rolled: Rolled, angle: float, seconds: float, filled: float, unknown: float
+) -> None:
+    assert rolled.angles == pytest.approx((angle,) * 4)
+    times = rolled.seconds, rolled.filled, rolled.unknown
+    assert times == pytest.approx((seconds, filled, unknown))
+
+
+@each("wheel", range(4))
+def test_a_wheel_that_alone_is_fast_after_a_gap_does_not_fill_it(wheel: int) -> None:
+    speeds = [0.0] * 4
+    speeds[wheel] = 40.0
+    damaged = Feedback(AT, WheelSpeeds(*speeds), 0.31, bridged=0.3)
+    assert rolled_over(Skipped(), damaged, AT_REST).angles == AT_REST
+    robot = Odometer()
+    robot.fold(line(0.0))
+    assert robot.fold(Feedback(AT, WheelSpeeds(*speeds), LONG_S + 0.04)).pose == Pose()
+
+
+def test_gaps_and_bridged_times_are_counted_but_a_gap_at_rest_is_not() -> None:
+    robot = Odometer()
+    robot.fold(line(0.0, 0.0, gap=2.0))
+    assert robot.odometry.counters() == {}
+    robot.fold(line(5.0))
+    robot.fold(line(5.0, 0.0, gap=0.25))
+    robot.fold(line(5.0, 0.04, bridged=0.03))
+    assert robot.odometry.counters() == {"gaps": 1, "gap_ms": 250, "gaps_filled_ms": 30}
+    robot.skip(line(5.0, 0.0, gap=0.5))
+    robot.fold(line(5.0))
+    assert robot.odometry.counters() == {"gaps": 2, "gap_ms": 750, "gaps_filled_ms": 30}
+
+
+# the turn of a gyro
+
+
+class Says(Gyro):
+    """A gyro that always reports the same turn."""
+
+    always: Turn | None = None
+
+    def turn(self, *line: object) -> Turn | None:
+        return self.always
+
+
+@each("turned", [None, (0.2, 0.1, 0.1, 0.2)])
+def test_the_wheels_give_only_the_distance_when_a_gyro_gives_the_turn(turned: Any) -> None:
+    wheels, gyro = Odometer(), Odometer()
+    gyro.use(Says(always=Turn(0.05, 1e-4, 4.0, 1e-3)))
+    by_wheels = wheels.fold(feedback(10.0, 20.0, 0.01, turned=turned))
+    by_gyro = gyro.fold(feedback(10.0, 20.0, 0.01, turned=turned))
+    assert by_gyro.pose.yaw == pytest.approx(0.05)
+    assert by_gyro.twist == Twist(by_wheels.twist.linear, 4.0)
+    assert by_gyro.positions == by_wheels.positions
+    assert gyro.odometry.travelled == pytest.approx(wheels.odometry.travelled)
+    # The gyro's scale adds 0.2 mrad to the 1e-6 of the start.
+    assert by_gyro.covariance.yawyaw - 1e-6 == pytest.approx(1e-4, rel=1e-3)
+    gyro.use(Says(always=Turn(0.3, 1e-4, 0.7, 1e-3)))  # over a gap too
+    assert gyro.fold(line(0.0, 0.0, gap=0.4)).pose.yaw == pytest.approx(0.35)
+
+
+# at rest
+
+
+def at_rest() -> tuple[Odometer, Estimate]:
+    robot = Odometer()
+    return robot, [robot.fold(counts(0.0)) for _ in range(25)][-1]
+
+
+def test_a_count_to_and_fro_at_rest_moves_nothing_then_or_later() -> None:
+    robot, before = at_rest()
+    for _ in range(1000):
+        robot.fold(counts(0.002))
+        after = robot.fold(counts(-0.002))
+    for name in ("pose", "covariance", "positions"):
+        assert getattr(after, name) == getattr(before, name)
+    assert robot.fold(counts(0.1, speed=10.0)).positions == pytest.approx((0.1,) * 4)
+
+
+@each(
+    ("first", "then", "times", "end", "slack"),
+    [
+        (0.002, -0.002, 100, -0.198, 0.01),  # it creeps back count by count
+        (0.0, 0.001, 1000, 1.0, 0.04),  # too slowly for two decimals
+    ],
+)
+def test_a_wheel_that_creeps_is_not_held(
+    first: float, then: float, times: int, end: float, slack: float
+) -> None:
+    robot, _ = at_rest()
+    robot.fold(counts(first))
+    for _ in range(times):
+        estimate = robot.fold(counts(then))
+    assert estimate.positions == pytest.approx((end,) * 4, abs=slack)
+    assert estimate.pose.x == pytest.approx(end * 0.05, abs=slack * 0.05)
+
+
+def test_no_count_of_a_rest_is_lost() -> None:
+    robot, _ = at_rest()
+    for _ in range(10):
+        robot.fold(counts(0.002))
+    estimate = robot.fold(counts(0.002, speed=1.0))
+    assert estimate.positions == pytest.approx((0.022,) * 4)
+    assert estimate.pose.x == pytest.approx(0.022 * 0.05)

@@ -1,0 +1,330 @@
+"""Which wheel to believe: blocked, running away, reversed, slipping, or turned by a hand."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import pytest
+
+from acsard.core.config.settings import DriveConfig, FeedbackConfig
+from acsard.core.link.feedback import Feedback
+from acsard.core.motion.gyro import Turn
+from acsard.core.motion.kinematics import Kinematics
+from acsard.core.motion.wheels import count_angle, new_wheels
+from acsard.core.values import WHEELS, WheelSpeeds
+from tests.each import each
+from tests.unit.liars import AT, PERIOD, fold, odometry
+from tests.unit.test_pose import Says
+
+
+def speeds_of(speeds: WheelSpeeds | float) -> WheelSpeeds:
+    return speeds if isinstance(speeds, WheelSpeeds) else WheelSpeeds(*[speeds] * 4)
+
+
+def only(wheel: int, speed: float, others: float = 10.0) -> WheelSpeeds:
+    return WheelSpeeds(*(speed if i == wheel else others for i in range(4)))
+
+
+TEN = speeds_of(10.0)
+
+
+class Bench:
+    """The verdicts on wheels, line by line. A single speed is that of all four wheels."""
+
+    def __init__(self, counts: int = 3200, encoders: bool = True) -> None:
+        self.kinematics, self.count = Kinematics(DriveConfig()), count_angle(counts)
+        self.feedback = FeedbackConfig(encoders=encoders)
+        self.wheels = new_wheels()
+        self.events: list[str] = []
+        self.faults: list[str] = []
+        self.missed: list[tuple[str, float]] = []  # sides that may have turned, and how far, rad
+        self.pushes = 0
+
+    def run(
+        self,
+        speeds: WheelSpeeds | float,
+        command: WheelSpeeds | float | None = None,
+        seconds: float = PERIOD,
+        turn: float | None = None,
+        late: bool = False,
+        noise: float = 0.0,
+    ) -> float:
+        """Feed lines for this time. Return when a wheel was left out, s, or inf.
+
+        `turn` is the gyro's rate, rad/s. In every second line `noise` is added to a turning wheel.
+        """
+        time_s, wheels = math.inf, self.wheels
+        before, wanted = wheels.status.left_out, None if command is None else speeds_of(command)
+        for number in range(round(seconds / PERIOD)):
+            more = noise * (number % 2)
+            a, b, c, d = (s + more * (s != 0.0) for s in speeds_of(speeds).as_tuple())
+            turned = a * PERIOD, b * PERIOD, c * PERIOD, d * PERIOD
+            by_gyro = None if turn is None else turn * PERIOD
+            wheels.commanded, wheels.late = wanted, late
+            reported = WheelSpeeds(a, b, c, d)
+            wheels.add(
+                turned, reported, PERIOD, by_gyro, self.feedback, self.kinematics, self.count
+            )
+            if wheels.status.left_out != before:
+                time_s = min(time_s, (number + 1) * PERIOD)
+            self.events += [event.kind for event in wheels.events]
+            self.pushes += bool(wheels.pushed)
+            if wheels.fault is not None:
+                self.faults.append(wheels.fault.code)
+            possible = wheels.possible_motion((0.0, 0.0, 0.0, 0.0))
+            self.missed += [(side, angles[0]) for side, angles in possible]
+        return time_s
+
+    def driven(self, speed: float = 10.0) -> Bench:
+        for step in range(101):
+            self.run(speed * min(1.0, step / 100), speed * min(1.0, step / 100))
+        self.run(speed, speed, 2.0)
+        assert self.text == ""
+        return self
+
+    def stopped(self, speed: float, keeps: float) -> Bench:
+        """Stop with a ramp of 20 rad/s2. The wheels follow until they report `keeps`, for ever."""
+        while speed > 0.0:
+            speed = max(0.0, speed - 20.0 * PERIOD)
+            self.run(max(speed, keeps), speed)
+        self.run(keeps, 0.0, 3.0)
+        return self
+
+    @property
+    def text(self) -> str:
+        return self.wheels.status.text
+
+
+# faults, warnings and reports
+
+
+@each("speed", [0.3, 1.0, 10.0])
+def test_wheels_that_roll_on_after_a_stop_are_a_fault_at_any_speed(speed: float) -> None:
+    bench = Bench().driven(speed)
+    bench.run(speed, 0.0, 0.7 + 1.0 / speed, noise=0.01)
+    assert bench.faults[0] == "wheel_runaway"
+    bench = Bench().driven(10.0)  # stalls hide none
+    for number in range(10):
+        bench.run(9.0, 0.0, 0.2, late=number % 2 == 0, noise=0.1)
+    assert bench.faults[0] == "wheel_runaway"
+
+
+@each("speed", [4.0, 10.0, 20.0])
+def test_also_with_whole_counts_in_each_line_or_faster_than_before(speed: float) -> None:
+    assert Bench().driven(speed).stopped(speed, speed).faults[0] == "wheel_runaway"
+    for before in (0.0, 0.1):
+        bench = Bench().driven(1.0)
+        bench.run(1.0, 0.0, before)
+        bench.run(3.0, 0.0, 2.0)
+        assert bench.faults[0] == "wheel_runaway"
+
+
+@each("keeps", [0.4, 0.8, 1.6])
+def test_wheels_that_follow_a_stop_and_keep_their_last_speed_are_a_warning(keeps: float) -> None:
+    bench = Bench().driven(5.0).stopped(5.0, keeps)
+    assert (bench.faults, set(bench.events)) == ([], {"wheel_stuck"})
+
+
+@each("half", [0.2, 0.4, 0.5])
+def test_a_reversed_wheel_is_a_fault_although_its_command_goes_up_and_down(half: float) -> None:
+    """A wheel that runs away from each rise and comes back at each fall comes no nearer."""
+    bench, speed = Bench(), 0.0
+    for step in range(round(6 * half / PERIOD)):
+        command = 8.0 if step * PERIOD % (2 * half) < half else 1.0
+        speed += (-command - speed) * PERIOD / 0.1
+        bench.run(round(speed, 2), command)
+    assert bench.faults[:1] == ["wheel_reversed"]
+
+
+def test_a_robot_that_is_faster_than_its_limiter_for_a_second_is_a_fault() -> None:
+    bench = Bench().driven()
+    bench.run(12.7, 10.0, 0.9)
+    assert bench.faults == []
+    bench.run(12.7, 10.0, 0.8)
+    assert bench.faults[0] == "wheel_too_fast"
+
+
+@each(
+    ("bench", "reported", "command", "seconds", "events", "text"),
+    [
+        (Bench, 0.0, 10.0, 1.0, ["wheel_blocked"] * 4, "front_left wheel is blocked, or has no"),
+        (
+            lambda: Bench().driven(1.08), 1.08, 0.0, 2.5, ["wheel_stuck"] * 4,
+            "rear_left wheel reports exactly 1.08 rad/s without a command",
+        ),
+    ],
+)  # fmt: skip
+def test_what_may_be_the_encoder_is_a_warning_until_it_ends(
+    bench: Callable[[], Bench],
+    reported: float,
+    command: float,
+    seconds: float,
+    events: list[str],
+    text: str,
+) -> None:
+    made = bench()
+    made.run(reported, command, seconds)
+    assert (made.faults, made.events) == ([], events)
+    assert text in made.text
+    made.run(command, command, 1.5)
+    assert made.text == ""
+
+
+def test_wheels_that_rested_and_are_then_turned_are_reported_and_never_a_fault() -> None:
+    bench = Bench()
+    bench.run(0.0, 0.0, 1.0)
+    bench.run(2.0, 0.0, 3.0, noise=0.1)
+    assert (bench.faults, bench.pushes >= 2) == ([], True)
+    bench = Bench().driven()  # also after a press, in which nothing proves a fault
+    bench.run(5.0, None, 1.0)
+    bench.run(0.0, None, 1.0)
+    bench.run(3.0, 0.0, 2.0, noise=0.1)
+    assert (bench.faults, bench.pushes >= 1) == ([], True)
+
+
+def test_what_sound_robots_do_is_no_fault() -> None:
+    # A slow motor that has come to rest: the smoothed speed of a coarse encoder falls for longer.
+    slow = Bench(counts=0).driven(18.0)
+    for step in range(300):
+        slow.run(18.0 * math.exp(-step * PERIOD / 0.342), 0.0)
+    # A limit that is lowered in motion.
+    lowered, speed, command = Bench().driven(15.0), 15.0, 15.0
+    for _ in range(600):
+        command = max(3.0, command - 0.2)
+        speed += (command - speed) * PERIOD / 0.6
+        lowered.run(speed, command)
+    # A board that stopped its motors in a stall: the lines of that time wait.
+    again = Bench().driven()
+    again.run(0.0, 10.0, 0.5, late=True)
+    for step in range(100):
+        again.run(0.09 * step, 0.1 * step)
+    blind = Bench(encoders=False)
+    blind.run(-10.0, 10.0, 5.0)
+    assert slow.faults == lowered.faults == again.faults == blind.faults == []
+    assert again.events == blind.events == []
+
+
+# a turn that both wheels of a side may have missed
+
+
+def test_both_wheels_of_a_side_that_report_no_turn_may_have_turned() -> None:
+    bench = Bench().driven()
+    bench.run(WheelSpeeds(0.0, 10.0, 10.0, 0.0), 10.0, 1.0)
+    assert {side for side, _ in bench.missed} == {"right"}
+    assert sum(angle for _, angle in bench.missed) == pytest.approx(10.0, rel=0.1)
+
+
+def test_motors_that_are_quicker_or_slower_than_declared_missed_none() -> None:
+    quick, speed = Bench(counts=0).driven(), 10.0
+    for step in range(200):
+        command = max(0.0, 10.0 - step / 2)
+        speed = round(speed + (command - speed) / 3, 2)
+        quick.run(speed, command)
+    slow, angle, speed = Bench(counts=16), 0.0, 0.0
+    slow.run(0.0, 0.0, 1.0)
+    for _ in range(300):  # within a count
+        speed += (1.5 - speed) * PERIOD / 0.35
+        before, angle = angle, angle + speed * PERIOD
+        counted = math.floor(16 * angle / math.tau) - math.floor(16 * before / math.tau)
+        slow.run(round(counted * math.tau / 16 / PERIOD, 2), 1.5)
+    assert quick.missed == slow.missed == []
+
+
+# wheels that the pose leaves out
+
+
+@each("wheel", range(4))
+@each("speed", [0.0, -10.0])
+def test_a_faulty_wheel_is_left_out_within_sixty_milliseconds_and_named(
+    wheel: int, speed: float
+) -> None:
+    bench = Bench().driven()
+    assert bench.run(only(wheel, speed), 10.0, 1.0) <= 0.06
+    assert bench.wheels.status.left_out == (WHEELS[wheel],)
+    # The other wheel of the side replaces it, and no other speed changes.
+    believed = bench.wheels.believed((1, 2, 3, 4))
+    expected = [1.0, 2.0, 3.0, 4.0]
+    expected[wheel] = expected[3 - wheel]
+    assert believed == pytest.approx(expected, rel=1e-3)
+
+
+def test_one_wheel_of_each_side_can_be_left_out_but_never_both_of_a_side() -> None:
+    bench = Bench().driven()
+    for speeds in (WheelSpeeds(0.0, 0.0, 10.0, 10.0), 0.0):
+        bench.run(speeds, 10.0, 1.0)
+        assert bench.wheels.status.left_out == ("front_left", "front_right")
+
+
+def test_a_wheel_that_was_left_out_counts_again_once_it_has_agreed_for_two_seconds() -> None:
+    bench = Bench().driven()
+    bench.run(only(2, 0.0), 10.0, 1.0)
+    for speed, seconds, out in ((0.0, 5.0, True), (10.0, 1.5, True), (10.0, 1.0, False)):
+        bench.run(speed, speed, seconds)  # at rest it agrees with every other
+        assert bench.wheels.status.left_out == ("rear_left",) * out
+    assert [kind for kind in bench.events if kind != "wheel_blocked"][:2] == ["left out", "again"]
+
+
+def test_the_wheel_angles_are_those_of_the_encoders_even_if_a_wheel_is_left_out() -> None:
+    robot = odometry()
+    for speeds in [TEN] * 100 + [only(0, 0.0)] * 100:
+        estimate, _ = fold(robot, Feedback(AT, speeds, PERIOD), TEN)
+    assert estimate.positions == pytest.approx((10.0, 20.0, 20.0, 20.0))
+    assert estimate.speeds == only(0, 0.0)
+
+
+@each("pushed", [0.5, 3.0, 12.0])
+@each("wheel", range(4))
+def test_a_push_by_hand_leaves_no_wheel_out_unless_a_gyro_shows_one(
+    pushed: float, wheel: int
+) -> None:
+    """Three wheels roll and one hangs in the air, or only the wheel in the air turns."""
+    for speeds in (only(wheel, 0.0, pushed), only(wheel, pushed, 0.0)):
+        bench = Bench()
+        assert bench.run(speeds, 0.0, 5.0, noise=0.1) == math.inf
+        assert bench.wheels.status.left_out == ()
+    bench = Bench()
+    assert bench.run(only(wheel, 0.0, 5.0), 0.0, 1.0, turn=0.0) <= 0.06
+    assert bench.wheels.status.left_out == (WHEELS[wheel],)
+
+
+# slip
+
+
+@each("wheel", range(4))
+def test_slip_is_reported_with_its_side_until_about_half_a_second_after_its_end(wheel: int) -> None:
+    bench, side = Bench().driven(), WHEELS[wheel].partition("_")[2]
+    bench.run(only(wheel, 11.0), 10.0, 0.2)
+    assert bench.wheels.status.slipping == (side,)
+    bench.run(10.0, 10.0, 0.4)
+    assert bench.wheels.slips
+    bench.run(10.0, 10.0, 0.5)
+    assert not bench.wheels.slips
+    # A wheel that spins in the air is not left out.
+    assert bench.run(only(wheel, 12.5), 10.0, 10.0) == math.inf
+    assert bench.wheels.status.slipping == (side,)
+
+
+def test_slip_makes_every_variance_a_hundred_times_larger() -> None:
+    calm, slipping = odometry(3200), odometry(3200)
+    for _ in range(200):
+        sure, _ = fold(calm, Feedback(AT, TEN, PERIOD), TEN)
+        fold(slipping, Feedback(AT, TEN, PERIOD), TEN)
+    begun = sure.covariance.yawyaw
+    for _ in range(100):
+        sure, _ = fold(calm, Feedback(AT, TEN, PERIOD), TEN)
+        unsure, _ = fold(slipping, Feedback(AT, only(0, 12.0), PERIOD), TEN)
+    assert unsure.twist_variances.linear > 90 * sure.twist_variances.linear
+    assert unsure.twist_variances.lateral == pytest.approx(100 * sure.twist_variances.lateral)
+    assert unsure.twist_variances.angular > 90 * sure.twist_variances.angular
+    assert unsure.covariance.yawyaw - begun > 80 * (sure.covariance.yawyaw - begun)
+    estimates = []
+    for slips in (False, True):  # a gyro that contradicts the wheels does so too
+        robot = odometry(3200)
+        robot.use(Says(always=Turn(0.0, 0.0, 0.0, 0.0, slips=slips)))
+        for _ in range(100):
+            estimate = robot.fold(Feedback(AT, TEN, PERIOD))
+        estimates.append(estimate)
+    sure, unsure = estimates
+    assert unsure.twist_variances.linear / sure.twist_variances.linear == pytest.approx(100.0)
+    assert unsure.covariance.xx > 90 * sure.covariance.xx

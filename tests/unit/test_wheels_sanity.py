@@ -1,0 +1,222 @@
+"""Impossible feedback is rejected with a reason; repeated rejection is a fault."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import pytest
+
+from acsard.core.config.settings import FeedbackConfig
+from acsard.core.link.feedback import Feedback
+from acsard.core.motion import sanity as module
+from acsard.core.motion.sanity import MAX_WHEEL_ACCELERATION, Sanity
+from acsard.core.values import WHEELS, Event, Instant, WheelSpeeds
+from tests.each import each
+
+UNKNOWN = math.inf
+"""The quantization step of encoders that are not known yet, rad/s."""
+
+
+def only(wheel: int, speed: float, others: float = 0.0) -> WheelSpeeds:
+    return WheelSpeeds(*(speed if i == wheel else others for i in range(4)))
+
+
+def line(speed: float, wheel: int = 1, others: float = 0.0, **more: Any) -> Feedback:
+    """Return a line with the speed of one wheel; `step` is that of all encoders."""
+    proven = more.pop("proven", False)  # the step was found by whole counts
+    more.setdefault("counted", (0.0,) * 4 if proven else None)
+    steps, dt = (more.pop("step", 0.0),) * 4, more.pop("dt", 0.01)
+    return Feedback(Instant(0, 0), only(wheel, speed, others), dt, steps=steps, **more)
+
+
+def lines(*speeds: float, **more: Any) -> list[Feedback]:
+    return [line(speed, **more) for speed in speeds]
+
+
+def ten(speed: float, **more: Any) -> Feedback:
+    return line(speed, others=speed, **more)
+
+
+GAP: dict[str, Any] = {"dt": 0.0, "gap": 0.5}
+COARSE: dict[str, Any] = {"step": 6.54}
+FINE: dict[str, Any] = {"step": 0.2}
+Row = tuple[float, float, list[Feedback], str]
+ROWS: dict[str, Row] = {
+    # The limit of the speed; the limit of a change is 100 rad/s2 x 10 ms and 2 rad/s.
+    "three in a row": (80, 1e9, lines(99, 99, 0, 99, 99, 99), "xx.xxF"),
+    "three at the start": (80, 1e9, lines(99, 99, 99), "xxF"),
+    "the most a wheel can do": (80, 100, lines(0, 3.0, 0, -3.01), "...x"),
+    "a change": (80, 100, lines(0, 3.5, 2.9), ".x."),
+    "a real step in time": (80, 400, [line(0), *[ten(10)] * 3], ".x.."),
+    "the first line, and a gap": (80, 10, [ten(10, dt=0.0), ten(0, **GAP)], ".."),
+    # The board repeats the mean of a pause.
+    "a pause": (
+        80, 100, [ten(10), ten(10, dt=0.25), ten(10), ten(10), *[ten(0)] * 26, ten(10)],
+        "." * 30 + "x",
+    ),
+    "a damaged first line": (80, 1500, lines(79, 0, 0, 0), ".x.."),
+    "a speed that no wheel reaches": (80, 1500, lines(79, 80.1, 80.1, 80.1), ".xxF"),
+    "a jump from what two lines agreed on": (80, 1500, lines(0, 0, 79, 79, 79), "..xxF"),
+    "lines that agree with no other": (80, 1500, lines(20, 79, -79, -30), ".xxF"),
+    "a damaged line of unknown encoders": (
+        80, 1500, [line(0), line(79, step=UNKNOWN), *lines(0, 0, 0, 0)], "..x...",
+    ),
+    "every second line is damaged": (
+        80, 1500, lines(0, 79, 0, -60, 0, 35, 0, -79, 0, 60, 0), ".x.x.x.x.x.",
+    ),
+    "a gap": (80, 1500, [*lines(0, 0, 79), line(0, **GAP), line(79)], "..x.x"),
+    # Coarse encoders: twice 31.4 rad/s more, and one proven count above the speed.
+    "a count at each end": (80, 100, lines(0, 65.7, -0.2, step=31.4), "..x"),
+    "two fine counts": (80, 100, lines(0, 4.0, step=0.5), ".."),
+    "one proven count": (40, 1500, lines(70, 71.5, step=31.4, proven=True), ".x"),
+    "the limit and a proven count": (40, 1500, lines(71.25, step=31.25, proven=True), "."),
+    "the limit and a learned step": (5, 1500, lines(11.54, -11.54, 11.55, **COARSE), "..x"),
+    # A wheel at 5.4 rad/s reports one step of 6.54 in most lines. Lines that always report a step
+    # or more have a mean above 5.5 rad/s.
+    "a mean that is possible": (5.5, 1500, lines(*[6.54] * 5, 0.0, **COARSE) * 20, "." * 120),
+    "a mean that is not": (5.5, 1500, lines(*[7.35] * 10, **COARSE), "." * 7 + "xxF"),
+    "a mean across a gap": (
+        5.5, 1500, [*lines(*[7.35] * 7, **COARSE), line(7.35, **COARSE, **GAP),
+                    *lines(*[7.35] * 6, **COARSE)], "." * 14,
+    ),
+    "damage before fast lines": (
+        20, 1500, lines(70, 21, 21, 21, 10.5, 10.5, step=10.5) * 10, "x....." * 10,
+    ),
+    "a fine step delays no fault": (5, 1500, lines(5.3, 5.3, 5.3, **FINE), "xxF"),
+    "no step above one count of 16": (80, 1500, [line(95, step=90.0)], "x"),
+    # A step that is unknown may be one count that the board reports in two lines. Of seven lines
+    # at 30 rad/s only five then prove a speed: a mean of 21.4 rad/s. Of eight, six do: 22.5.
+    "an unknown step": (22, 1500, lines(*[30.0] * 10, others=4.0, step=UNKNOWN), "." * 7 + "xxF"),
+    "each wheel has its time": (
+        10, 1500, [line(30, wheel, step=UNKNOWN) for wheel in (0, 1, 2, 3, 1, 1, 3, 0, 2, 2)],
+        "." * 10,
+    ),
+    "a slow line ends it": (10, 1500, lines(*[30.0, 30.0, 0.0] * 9, step=UNKNOWN), "." * 27),
+    "unknown, but over the limit": (80, 1500, lines(0, 79.9, 80.1, step=UNKNOWN), "..x"),
+    "unknown, and a proven count": (80, 1500, [line(80.1, step=UNKNOWN, proven=True)], "x"),
+    "unknown, from the first line": (80, 1500, lines(99, 99, 99, step=UNKNOWN), "xxF"),
+    # One count of 16 in 10 ms is 39.27 rad/s; a higher speed comes from a damaged digit.
+    "unknown, one count of 16": (10, 1500, lines(39.26, 4, step=UNKNOWN), ".."),
+    "unknown, more than that": (10, 1500, lines(39.28, 4, step=UNKNOWN), "x."),
+    # In the time of the line or 5 ms, but not in a line without a time, which adds no motion.
+    "without a time": (10, 1500, lines(10, 10.02, dt=0.0, step=UNKNOWN), ".x"),
+    "in 5 ms": (10, 1500, lines(78.53, 78.55, dt=1e-6, step=UNKNOWN), ".x"),
+    "in 20 ms": (10, 1500, lines(19.63, 19.65, dt=0.02, step=UNKNOWN), ".x"),
+    "lost lines do not count": (10, 1500, [line(39, dt=0.05, bridged=0.04, step=UNKNOWN)], "."),
+}  # fmt: skip
+
+
+def verdicts(sanity: Sanity, some: list[Feedback], fastest: float = 80.0) -> str:
+    """Return for each line: `.` possible, `x` impossible, `F` a fault."""
+    found = ""
+    for each_line in some:
+        why = sanity.impossible(each_line, fastest)
+        found += "F" if sanity.doubtful else "x" if why else "."
+    return found
+
+
+@pytest.mark.parametrize("name", ROWS)
+def test_lines(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    fastest, acceleration, some, expected = ROWS[name]
+    monkeypatch.setattr(module, "MAX_WHEEL_ACCELERATION", acceleration)
+    assert verdicts(Sanity(), some, fastest) == expected
+
+
+def test_the_limits() -> None:
+    assert (MAX_WHEEL_ACCELERATION, FeedbackConfig().wheel_speed) == (1500.0, 80.0)
+
+
+@each("wheel", range(4))
+def test_the_reason_names_the_wheel_and_the_setting(wheel: int) -> None:
+    assert Sanity().impossible(line(-80.01, wheel), 80.0).startswith(WHEELS[wheel])
+    sanity = Sanity()
+    assert verdicts(sanity, lines(0, 0)) == ".."
+    why = sanity.impossible(line(60, wheel), 80.0)
+    assert why == f"{WHEELS[wheel]} jumps from 0.00 to 60.00 rad/s, which is over 1500 rad/s2"
+
+
+def test_forgetting_starts_over_but_the_last_line_is_still_compared() -> None:
+    sanity = Sanity()
+    verdicts(sanity, lines(0, 99, 99, 99))
+    sanity.forget()
+    assert not sanity.doubtful
+    assert verdicts(sanity, lines(79, 0)) == "x."
+    fast = lines(*[32.0] * 5, others=4.0, step=UNKNOWN)
+    sanity = Sanity()
+    assert verdicts(sanity, fast, 20) == "....."
+    sanity.forget()
+    assert verdicts(sanity, [*fast, fast[0]], 20) == ".....x"
+
+
+@each("speed", [-79.0, -42.0, -10.0, 10.0, 42.0, 79.0])
+@each("seconds", [0.03, 0.04, 0.06, 0.1, 0.6])
+def test_a_damaged_line_that_covers_a_pause_is_no_fault_of_the_true_lines(
+    seconds: float, speed: float
+) -> None:
+    found = verdicts(Sanity(), [*lines(0, 0), line(speed, dt=seconds), *lines(*[0.0] * 5)])
+    assert found[4:] == "...."
+    assert "F" not in found
+
+
+@each("number", [1, 2])
+def test_one_count_is_never_too_fast_and_two_in_its_time_are(number: int) -> None:
+    """A host that catches up after a stall may ask again after 4 ms.
+
+    One count of 16 in this time is then 98 rad/s.
+    """
+    count = math.tau / 16
+    turned = (number * count, 0.0, 0.0, 0.0)
+    for given in ("turned", "counted"):
+        more: dict[str, Any] = {given: turned}
+        fast = line(number * count / 0.004, 0, count=count, **more)
+        assert verdicts(Sanity(), [fast], 50) == ".x"[number == 2]
+
+
+def test_the_step_of_one_wheel_excuses_nothing_before_the_steps_of_the_others_are_known() -> None:
+    steps = (UNKNOWN, 99.0, UNKNOWN, UNKNOWN)
+    fast = Feedback(Instant(0, 0), only(1, 99.0), 0.01, steps=steps)
+    assert verdicts(Sanity(), [fast]) == "x"
+
+
+def test_a_slow_line_of_one_wheel_ends_only_the_fast_time_of_that_wheel() -> None:
+    sanity, names = Sanity(), []
+    for first in (0.0, 30.0, 30.0, 0.0, 30.0, 30.0, 30.0, 0.0):
+        fast = Feedback(Instant(0, 0), WheelSpeeds(first, 32.0), 0.01, steps=(UNKNOWN,) * 4)
+        names.append(sanity.impossible(fast, 20.0).partition(" ")[0])
+    # The limit and 2 / 5 of 32 rad/s are 32.8 rad/s, and with 2 / 6 they are 30.7 rad/s.
+    assert names == [""] * 5 + ["front_left"] * 3
+
+
+@each("counts", [16, 40, 96, 200])
+@each("rate", [50, 100, 200])
+@each("limit", [4.0, 10.0])
+def test_no_wheel_within_its_limit_is_too_fast_before_its_step_is_known(
+    counts: int, rate: int, limit: float
+) -> None:
+    count, angle, before, some = math.tau / counts, 0.0, 0, []
+    for number in range(400):
+        angle += limit * min(1.0, number / 20) / rate
+        now = math.floor(angle / count)
+        some.append(line((now - before) * count * rate, 3, step=UNKNOWN, dt=1 / rate))
+        before = now
+    assert verdicts(Sanity(), some, 1.1 * limit) == "." * 400
+
+
+def warnings(sanity: Sanity, bad: int) -> list[Event]:
+    """Return the warnings after a window of 1000 lines whose first `bad` ones are impossible."""
+    found = []
+    for i in range(1000):
+        sanity.impossible(ten(200.0 if i < bad else 10.0), 80.0)
+        found.append(sanity.warning)
+    assert all(warning is None for warning in found[:10])
+    return [warning for warning in found if warning is not None]
+
+
+def test_more_than_one_line_in_a_hundred_is_one_warning() -> None:
+    sanity = Sanity()
+    assert [len(warnings(sanity, bad)) for bad in (10, 11, 10, 511)] == [0, 1, 0, 1]
+    (event,) = warnings(sanity, 1000)
+    assert (event.name, event.level) == ("lines_implausible", "warning")
+    assert event.text.startswith("11 of 11 lines")
+    assert "front_right at 200.00 rad/s is over feedback.wheel_speed" in event.text
