@@ -47,7 +47,9 @@ def units(door: Door) -> None:
 
 
 def zero(door: Door) -> None:
-    """No speed is followed before a zero of the same sender."""
+    """No speed is followed before a zero of the same sender, and again after a stop."""
+    if not door.zeroes:
+        door.arm()
     disarm(door.bus)
     with door.bus.follow("cmd/**") as commands, door.bus.follow("cmd_vel_out") as applied:
         if door.zeroes:
