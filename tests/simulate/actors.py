@@ -528,14 +528,16 @@ class Run:
     def _check_state(self) -> None:
         """Check the speeds and the pose in `state`.
 
-        The check is left out shortly after the host stalled or slept.
+        The check is left out shortly after the host stalled or slept: behind a stall, the daemon
+        gives the board a third of the quiet time more.
         """
-        product, since_ns = self.product, self.true_ns - NS // 10
+        product, witness = self.product, self.witness
+        waits_ns = max(NS // 10, witness.quiet_ns // 3 + witness.period_ns)
         # An echo of zeros looks like a board at rest.
         if self.echo.on or not product.alive:
             return
-        if self._stalled_ns < since_ns and self.resumed_ns < product.now_ns - NS:
-            state, quiet_ns = product.state(), self.witness.quiet_ns + self.witness.period_ns
+        if self._stalled_ns < self.true_ns - waits_ns and self.resumed_ns < product.now_ns - NS:
+            state, quiet_ns = product.state(), witness.quiet_ns + witness.period_ns
             judge_state(self.true_ns, state, self._fed_ns, quiet_ns)
             if self.pose.latest is not None and not self._calls:
                 judge_pose(self.true_ns, state, self.pose.latest, self._fed_ns, quiet_ns)
