@@ -1,7 +1,8 @@
 """Connects to the daemon of the page's robot, follows its state and the keys of the viewers, and
 detects silence.
 
-This work has a thread of its own, which may wait for the bus. The event loop reads its results.
+This work has a thread of its own, which may wait for the bus. The event loop reads its results. A
+query has another thread: a daemon that hangs lets it wait for seconds, and its silence must show.
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Mapping
 from contextlib import suppress
+from functools import partial
 from typing import Any
 
 import msgspec
@@ -26,7 +28,7 @@ from acsard.core.messages.encodings import DecodeError
 from acsard.core.messages.schema import Info, RobotState
 from acsard.host import clock
 from acsard.host.errors import MendableError, UnreachableError
-from acsard.host.threads import in_thread
+from acsard.host.threads import NoThreadError, Worker, in_thread
 from acsard.web.metrics import Counts
 from acsard.web.streams import Streams
 
@@ -123,13 +125,17 @@ class FollowedRobot:
             except UnreachableError as error:
                 self.gone = str(error)
                 time.sleep(RETRY_DELAY_S)
-        watch = Watch(self.client, clock.steady_s())
+        watch, query = Watch(self.client, clock.steady_s()), None
         while not self._is_leaving:
             self.streams.update(self.client)
-            self._look(watch, clock.steady_s())
-            if not self.gone and clock.steady_s() >= self._about_due_s:
-                self._about_due_s = clock.steady_s() + ABOUT_PERIOD_S
-                self._query_about(self.client)
+            now = clock.steady_s()
+            self._look(watch, now)
+            is_free = query is None or not query.is_alive()
+            if is_free and not self.gone and now >= self._about_due_s:
+                self._about_due_s = now + ABOUT_PERIOD_S
+                query = Worker("about", partial(self._query_about, self.client))
+                with suppress(NoThreadError):
+                    query.start()
             time.sleep(PROCESS_PERIOD_S)
 
     def _look(self, watch: Watch, now: float) -> None:

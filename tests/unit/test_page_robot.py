@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import threading
 import time
 from collections.abc import Callable, Iterator
 from typing import Any, cast
@@ -165,6 +166,30 @@ async def test_the_page_learns_about_its_robot_although_it_was_not_there_at_firs
     assert not running.done()
     assert page.gone == ""
     running.cancel()
+
+
+async def test_a_query_that_hangs_does_not_hide_the_silence_of_its_robot(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    client, answers = AnsweringRobot(failures=0), threading.Event()
+
+    def get(name: str) -> Any:
+        answers.wait(20.0)
+        raise NoAnswerError("no answer")
+
+    monkeypatch.setattr(client, "get", get)
+    client.queue.append(sample_of(STATE))
+    page = FollowedRobot(
+        Address("tcp/x:1", "acsar", ""), lambda: cast(Any, client), ABOUT, Counts()
+    )
+    running = asyncio.create_task(page.run())
+    async with asyncio.timeout(10.0):
+        while page.gone:
+            await asyncio.sleep(0.01)
+        while not page.gone:
+            await asyncio.sleep(0.01)
+    running.cancel()
+    answers.set()
 
 
 def test_the_path_keeps_ten_minutes_a_bounded_number_of_points_and_the_newest_place() -> None:
