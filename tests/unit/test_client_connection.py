@@ -255,6 +255,8 @@ def test_each_method_reports_a_closed_connection(session: Session) -> None:
     ):
         with pytest.raises(NoAnswerError, match="connection of this client is closed"):
             method()
+    with pytest.raises(NoAnswerError, match="connection of this client is closed"):
+        asyncio.run(AsyncClient(robot).get("odom"))
 
 
 def without_states(robot: Connection, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -305,12 +307,6 @@ async def test_an_async_call_that_takes_too_long_raises_a_documented_error(
             await getattr(robot, method)(**fields.get(method, {}))
     finally:
         released.set()
-
-
-async def test_an_async_call_raises_the_error_of_the_call_itself(session: Session) -> None:
-    session.close()
-    with pytest.raises(NoAnswerError, match="connection of this client is closed"):
-        await AsyncClient(client_of(session)).get("odom")
 
 
 async def test_an_async_call_without_a_new_thread_raises_a_documented_error(
@@ -411,35 +407,28 @@ def test_over_tls_a_service_that_the_robot_does_not_have_is_refused_with_those_t
         ours.request("dance", {})
 
 
-@pytest.mark.parametrize("names_role", [False, True])
-def test_over_tls_the_error_names_the_role_only_if_no_command_arrived(
-    session: Session, monkeypatch: pytest.MonkeyPatch, names_role: bool
-) -> None:
+@each(
+    ("tls", "role", "lacks_only_commands", "kind", "words"),
+    [
+        ("", "operator", True, client.NotDrivenError, "why"),
+        ("certificates", "operator", False, client.NotDrivenError, "why"),
+        # Only if no command arrived, the role may be the reason.
+        ("certificates", "operator", True, client.NotDrivenError, "anna has the role operator"),
+        ("certificates", "viewer", False, client.NotPermittedError, "anna has the role viewer"),
+    ],
+)
+def test_the_error_of_a_drive_names_the_role_if_it_may_be_the_reason(
+    session: Session, monkeypatch: pytest.MonkeyPatch,
+    tls: str, role: Any, lacks_only_commands: bool, kind: type[AcsardError], words: str,
+) -> None:  # fmt: skip
     ours = client_of(session)
-    ours.where = ours.where._replace(tls="certificates")
-    monkeypatch.setattr(ours, "whoami", lambda: ClientIdentity("operator", "anna", "anna/1"))
-    error = ours.explain_error(UnheardError("why", lacks_only_commands=names_role))
-    assert type(error) is client.NotDrivenError
-    assert str(error).startswith("why")
-    assert ("your certificate anna has the role operator" in str(error)) == names_role
-
-
-def test_over_tls_a_viewer_gets_a_permission_error_whatever_the_robot_reports(
-    session: Session, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    ours = client_of(session)
-    ours.where = ours.where._replace(tls="certificates")
-    monkeypatch.setattr(ours, "whoami", lambda: ClientIdentity("viewer", "anna", "anna/1"))
-    error = ours.explain_error(UnheardError("why", lacks_only_commands=False))
-    assert isinstance(error, client.NotPermittedError)
-
-
-def test_a_drive_without_arriving_commands_ends_with_a_documented_error(
-    session: Session,
-) -> None:
-    error = client_of(session).explain_error(UnheardError("why", lacks_only_commands=True))
-    assert type(error).__name__ in client.__doc__.split()
-    assert isinstance(error, client.NotDrivenError)
+    ours.where = ours.where._replace(tls=tls)
+    monkeypatch.setattr(ours, "whoami", lambda: ClientIdentity(role, "anna", "anna/1"))
+    error = ours.explain_error(UnheardError("why", lacks_only_commands=lacks_only_commands))
+    assert type(error) is kind
+    assert words in str(error)
+    assert ("role" in str(error)) == ("role" in words)
+    assert kind.__name__ in client.__doc__.split()
 
 
 TURN = b'{"angular_velocity":{"z":0.5}}'
