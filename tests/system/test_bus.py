@@ -10,7 +10,6 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
 
 import msgspec
 import pytest
@@ -129,62 +128,28 @@ def test_info_has_the_identity_of_the_daemon(bus: Bus, shared: Daemon) -> None:
     assert info["port"].startswith("/dev/pts/")
 
 
-def test_config_is_the_configuration_in_force(bus: Bus, shared: Daemon) -> None:
-    config = bus.get("config")
-    assert config["mcu"]["port"] == "sim"
-    assert config["bus"]["listen"] == [shared.endpoint]
-    assert config["drive"]["wheel_radius"] == 0.05
-    assert [source["name"] for source in config["commands"]["sources"]][:2] == ["teleop", "app"]
-
-
-def test_a_get_on_every_schema_answers_one_per_type(bus: Bus) -> None:
-    answers = bus.ask("schema/*")
-    assert all(answer.ok for answer in answers)
-    types = [answer.key.removeprefix("schema/") for answer in answers]
-    assert len(types) == len(set(types))
-    asked = {"ServiceReply", "Twist", "JointStateIn", "SetPose", "Settings", "Config"}
-    assert {*PUBLISHED.values(), *asked} <= set(types)
-
-
-@pytest.mark.parametrize("latched", [False, True], ids=["ready", "stopped"])
-def test_a_get_by_wildcard_never_runs_a_service(bus: Bus, latched: bool) -> None:
+def test_a_get_by_wildcard_never_runs_a_service(bus: Bus) -> None:
     with restored(bus):
         assert bus.get("srv/set_pose", {"x": 3.0, "y": 2.0, "yaw": 1.0})["success"]
-        if latched:
-            bus.get("srv/stop")
-        before = bus.comes_to("stopped" if latched else "ready")
+        before = bus.comes_to("ready")
         for pattern in ("**", "*", "srv/*", "srv/s$*", "srv/**"):
             start = time.monotonic()
             answers = bus.ask(pattern, {"x": 7.0, "y": 7.0, "yaw": 0.0})
             took = time.monotonic() - start - lost(start)
             after = bus.comes_to(before["mode"])
-            assert (after["mode"], after["reason"]) == (before["mode"], before["reason"])
             # Neither reset nor set; encoders may still tick over by a fraction of a millimetre.
             pose = after["x"], after["y"], after["yaw"]
             assert pose == pytest.approx((3.0, 2.0, 1.0), abs=0.01)
-            assert all(answer.ok for answer in answers)
             answered = {answer.key for answer in answers}
-            if pattern in ("*", "**"):
-                keys = {*PUBLISHED, "info", "config", "topics", "interfaces"}
-                assert {key for key in keys if pattern == "**" or "/" not in key} <= answered
-                assert not {key for key in answered if key.startswith("srv/")}
-            else:
-                assert answered == set()
+            assert not {key for key in answered if key.startswith("srv/")}
+            keys = {*PUBLISHED, "info", "config", "topics", "interfaces"}
+            wide = pattern in ("*", "**")
+            assert {k for k in keys if wide and (pattern == "**" or "/" not in k)} <= answered
             # If the answers never ended, the client would lose its whole timeout of 5 s.
             assert took < 2.0
 
 
 # services
-
-
-def test_deactivate_and_activate_by_their_exact_keys(bus: Bus) -> None:
-    with restored(bus):
-        assert bus.get("srv/deactivate")["success"]
-        assert bus.state()["mode"] == "inactive"
-        assert bus.state()["code"] == "switched_off"
-        assert bus.get("srv/activate")["success"]
-        # While the link is up the state is never "waiting", which means that there is no link.
-        bus.comes_to("ready")
 
 
 def test_set_pose_and_reset_odometry_move_the_pose_of_every_key(bus: Bus) -> None:
@@ -288,28 +253,6 @@ def test_every_published_key_names_its_encoding_and_has_the_same_fields_in_json(
                 assert set(entry.value) == FIELDS[key]
 
 
-def test_an_event_has_its_name_level_count_text_and_client(bus: Bus) -> None:
-    before = bus.get("events")
-    with bus.follow("events") as messages:
-        bus.get("srv/reset_odometry")
-        # Messages of other tests here may be reported at any moment.
-        entry = messages.find(
-            lambda message: (
-                message["total"] > before["total"]
-                and message["events"][-1]["name"] == "reset_odometry"
-            ),
-            3.0,
-            "news",
-        )
-    last = entry.value["events"][-1]
-    assert last["level"] == "info"
-    assert last["count"] >= 1  # actions of other tests in the same second are counted with it
-    assert "x 0, y 0" in last["text"]
-    assert last["by"]
-    assert seconds(last["stamp"]) == seconds(entry.value["stamp"]) >= seconds(before["stamp"])
-    assert len(entry.value["events"]) <= 20
-
-
 def test_each_json_message_equals_the_message_on_the_plain_key(bus: Bus) -> None:
     with bus.follow("odom") as packed, bus.follow("json/odom") as texts:
         until(lambda: len(packed.seen) > 20 and len(texts.seen) > 20, 5.0, "both")
@@ -359,26 +302,6 @@ def test_odometry_comes_a_hundred_times_a_second_and_state_ten_times(bus: Bus) -
         # Messages that the machine delayed at the beginning have a late stamp, so the span is
         # short.
         assert least * rate <= count <= (1 + near) * (span + machine_s) * rate + more
-
-
-def test_odom_tf_and_wheel_states_of_one_sample_carry_one_stamp(bus: Bus) -> None:
-    def stamps(following: Following, header: Any) -> set[tuple[int, int]]:
-        groups = [header(entry.value)["stamp"] for entry in list(following.seen)]
-        return {(stamp["sec"], stamp["nanosec"]) for stamp in groups}
-
-    with bus.follow("odom") as odom, bus.follow("tf") as tf, bus.follow("wheel_states") as wheels:
-        three = (odom, tf, wheels)
-        until(lambda: all(len(item.seen) > 40 for item in three), 5.0, "40 of each")
-        groups = [
-            stamps(odom, lambda value: value["header"]),
-            stamps(tf, lambda value: value["transforms"][0]["header"]),
-            stamps(wheels, lambda value: value["header"]),
-        ]
-    # The subscriptions began and ended one after the other. In between the streams are the same.
-    first, last = max(map(min, groups)), min(map(max, groups))
-    between = [{stamp for stamp in item if first <= stamp <= last} for item in groups]
-    assert len(between[0]) > 20
-    assert between[0] == between[1] == between[2]
 
 
 def test_a_late_advanced_subscriber_gets_tf_static_within_a_second(bus: Bus) -> None:

@@ -93,9 +93,6 @@ def same(message: Any, value: Any) -> bool:
     ("topic", "count"),
     [
         ("/odom", 4),
-        pytest.param("/tf", 4, marks=SLOW),
-        pytest.param("/joint_states", 4, marks=SLOW),
-        pytest.param("/cmd_vel_out", 4, marks=SLOW),
         pytest.param("/diagnostics", 2, marks=SLOW),
     ],
 )

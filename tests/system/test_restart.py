@@ -205,17 +205,10 @@ class End(NamedTuple):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "ends",
-    [
-        (End("stop", "kill"), End("fault", "crash"), End("inactive", "abort")),
-        pytest.param((End("stop", "term"), End("stop", "kill", cut)), marks=pytest.mark.slow),
-    ],
-)
 def test_a_latched_robot_stays_at_rest_after_each_restart_until_it_is_released(
-    robot: Robot, ends: tuple[End, ...]
+    robot: Robot,
 ) -> None:
-    restarted(robot, *ends)
+    restarted(robot, End("stop", "kill"), End("fault", "crash"), End("inactive", "abort"))
 
 
 @pytest.mark.soak
