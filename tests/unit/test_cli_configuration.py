@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import os
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 
 import msgspec
@@ -24,7 +24,8 @@ from acsard.host.config_file import SEARCH_PATHS, find, writable
 from acsard.host.errors import Exit, MendableError, UnreachableError, UsageError
 from acsard.host.version import version
 from acsard.machine.doctor import OPTION_KEYS
-from tests.each import each
+
+DEFAULTS = "built-in defaults"
 
 
 class Places:
@@ -59,39 +60,32 @@ def test_the_file_is_searched_in_the_working_directory_and_in_etc() -> None:
     assert [str(place) for place in SEARCH_PATHS] == ["acsard.toml", "/etc/acsard/acsard.toml"]
 
 
-def test_the_option_wins_over_all_others(places: Places, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(
+    ("option", "variable", "there", "found"),
+    [
+        ("option", "variable", ("here", "etc"), "option"),
+        (None, "variable", ("here", "etc"), "variable"),
+        (None, None, ("here", "etc"), "here"),
+        (None, "", ("here", "etc"), "here"),
+        (None, None, ("etc",), "etc"),
+        (None, None, (), ""),
+    ],
+)
+def test_the_option_wins_then_the_variable_then_the_file_here_and_that_in_etc(
+    places: Places, monkeypatch: pytest.MonkeyPatch,
+    option: str | None, variable: str | None, there: tuple[str, ...], found: str,
+) -> None:  # fmt: skip
     places.fill()
-    monkeypatch.setenv("ACSARD_CONFIG", str(places.variable))
-    assert find(str(places.option)) == (str(places.option), places.option.read_bytes())
-
-
-def test_the_variable_wins_over_the_places(places: Places, monkeypatch: pytest.MonkeyPatch) -> None:
-    places.fill()
-    monkeypatch.setenv("ACSARD_CONFIG", str(places.variable))
-    assert find(None) == (str(places.variable), places.variable.read_bytes())
-
-
-def test_the_file_here_wins_over_etc(places: Places) -> None:
-    places.fill()
-    assert find(None) == ("acsard.toml", places.here.read_bytes())
-
-
-def test_the_file_in_etc_is_used_last(places: Places) -> None:
-    places.fill()
-    places.here.unlink()
-    assert find(None) == (str(places.etc), places.etc.read_bytes())
-
-
-@pytest.mark.usefixtures("places")
-def test_without_a_file_the_defaults_are_used() -> None:
-    assert find(None) == ("built-in defaults", b"")
-    assert load(None) == ("built-in defaults", Config())
-
-
-def test_an_empty_variable_names_nothing(places: Places, monkeypatch: pytest.MonkeyPatch) -> None:
-    places.fill()
-    monkeypatch.setenv("ACSARD_CONFIG", "")
-    assert find(None)[0] == "acsard.toml"
+    for name in {"here", "etc"} - {*there}:
+        getattr(places, name).unlink()
+    if variable is not None:
+        monkeypatch.setenv("ACSARD_CONFIG", variable and str(places.variable))
+    where, text = find(option and str(places.option))
+    if not found:
+        assert (where, text, load(None)) == (DEFAULTS, b"", (DEFAULTS, Config()))
+        return
+    assert where == ("acsard.toml" if found == "here" else str(getattr(places, found)))
+    assert text == getattr(places, found).read_bytes()
 
 
 def test_a_named_file_that_is_missing_is_an_error_and_never_replaced(
@@ -268,48 +262,27 @@ def test_a_good_file_is_printed_as_json_on_request(
     assert from_builtins(msgspec.json.decode(capsys.readouterr().out)) == parse(file.read_bytes())
 
 
-def given_by(*words: str) -> dict[str, dict[str, object]]:
-    return overrides(run.options(parser(["run"]).parse_args(["run", *words])))
+def given_by(words: Iterable[str]) -> dict[str, object]:
+    """Return the values that these words of `acsard run` set, by their keys."""
+    found = overrides(run.options(parser(["run"]).parse_args(["run", *words])))
+    return {f"{table}.{key}": value for table, keys in found.items() for key, value in keys.items()}
 
 
-def test_without_options_nothing_is_overridden() -> None:
-    assert given_by() == {}
-
-
-def test_the_options_are_the_keys_of_the_configuration() -> None:
-    flags = given_by("--port", "/dev/x", "--baud-rate", "57600", "--id", "r7", "--namespace", "a/b",
-                     "--listen", "tcp/127.0.0.1:1", "--connect", "tcp/[::1]:2")  # fmt: skip
-    config = parse(b"", flags)
-    assert (config.mcu.port, config.mcu.baud_rate) == ("/dev/x", 57600)
-    assert (config.robot.id, config.ros.namespace) == ("r7", "a/b")
-    assert config.bus.listen == ("tcp/127.0.0.1:1",)
-    assert config.bus.connect == ("tcp/[::1]:2",)
-
-
-def test_the_doctor_knows_every_key_that_options_set() -> None:
-    flags = given_by("--port", "x", "--baud-rate", "9600", "--id", "r", "--namespace", "n",
-                     "--record", "d", "--listen", "tcp/127.0.0.1:1", "--connect", "tcp/127.0.0.1:2",
-                     )  # fmt: skip
-    keys = {f"{section}.{key}" for section, values in flags.items() for key in values}
-    assert keys == set(OPTION_KEYS)
-
-
-@each(
-    ("words", "table"),
-    [
-        (["--port", "x"], "mcu"),
-        (["--id", "x"], "robot"),
-        (["--namespace", "x"], "ros"),
-        (["--listen", "tcp/[::1]:1"], "bus"),
-        (["--connect", "tcp/[::1]:1"], "bus"),
-    ],
-)
-def test_one_option_changes_its_own_table_only(words: list[str], table: str) -> None:
-    flags = given_by(*words)
-    assert list(flags) == [table]
-    config, default = parse(b"", flags), Config()
-    changed = [n for n in Config.__struct_fields__ if getattr(config, n) != getattr(default, n)]
-    assert changed == [table]
+def test_each_option_sets_its_key_and_no_other_and_the_doctor_knows_them() -> None:
+    words = {
+        ("--port", "/dev/x"): ("mcu.port", "/dev/x"),
+        ("--baud-rate", "57600"): ("mcu.baud_rate", 57600),
+        ("--id", "r7"): ("robot.id", "r7"),
+        ("--namespace", "a/b"): ("ros.namespace", "a/b"),
+        ("--record", "d"): ("record.directory", "d"),
+        ("--listen", "tcp/127.0.0.1:1"): ("bus.listen", ["tcp/127.0.0.1:1"]),
+        ("--connect", "tcp/[::1]:2"): ("bus.connect", ["tcp/[::1]:2"]),
+    }
+    assert given_by(()) == {}
+    for typed, (key, value) in words.items():
+        assert given_by(typed) == {key: value}
+        assert parse(b"", {key.partition(".")[0]: {key.partition(".")[2]: value}}) != Config()
+    assert {key for key, _ in words.values()} == set(OPTION_KEYS)
 
 
 def test_the_banner_has_the_approved_words(approved: Callable[[Path, str], None]) -> None:
