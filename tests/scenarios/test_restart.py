@@ -230,18 +230,6 @@ def test_the_answer_of_a_stop_says_that_it_cannot_be_kept() -> None:
     assert "would not survive" not in host.world.call("stop").message
 
 
-@pytest.mark.parametrize("hangs", [False, True])
-def test_the_answers_before_the_exit_wait_a_limited_time_for_the_file(hangs: bool) -> None:
-    host = Host(random.Random(14))
-    host.world.run(0.5)
-    host.file.is_stored, host.file.hangs = False, hangs
-    assert not host.world.ask("srv/stop")
-    host.world.loop.finish(host.world.instant)
-    assert host.file.waited == 1
-    (replies,) = host.world.bus.replies.values()
-    assert len(replies) == 1
-
-
 @pytest.mark.variations(4)
 @pytest.mark.parametrize("by", ["put", "call"])
 @pytest.mark.parametrize(

@@ -141,32 +141,6 @@ def test_keyboard_drives_after_k_was_held_for_a_second(world: World, road: Road)
     drives(world, lambda: keyboard.press(FAST, 1.5))
 
 
-def test_keyboard_by_rmw_drives_immediately_after_one_k(world: World) -> None:
-    keyboard = Keyboard(world, "rmw")
-    keyboard.press(0.0, 1.1)
-    keyboard.press(FAST, 1.5)
-    stop_and_clear(world, lambda: keyboard.press(FAST, 2.0))
-    keyboard.send(0.0)
-    drives(world, lambda: keyboard.hold(FAST, 0.2, 30.0))
-
-
-def test_one_zero_of_a_new_publisher_by_rmw_is_enough(world: World) -> None:
-    keyboard = Keyboard(world, "rmw")
-    keyboard.send(0.0)
-    world.run(3.0)
-    drives(world, lambda: keyboard.press(FAST, 1.0))
-
-
-def test_keyboard_by_the_bridge_waits_for_a_second_after_k(world: World) -> None:
-    keyboard = Keyboard(world, "bridge")
-    keyboard.send(0.0)
-    world.run(0.9)
-    check_stays_at_rest(world, lambda: keyboard.press(FAST, 1.0))
-    keyboard.send(0.0)
-    world.run(1.1)
-    drives(world, lambda: keyboard.hold(FAST, 0.2, 30.0))
-
-
 # teleop_twist_joy and joy_teleop
 
 
@@ -305,17 +279,6 @@ def test_topic_pub_of_a_speed_never_drives_however_often_it_is_started(
         name = f"before a pause of {pause} s"
         check_stays_at_rest(world, partial(topic_pub, world, road, name, FAST, 3.0))
         world.run(pause)
-
-
-def test_topic_pub_of_a_zero_by_rmw_arms_no_other_sender(world: World) -> None:
-    topic_pub(world, "rmw", "zero", 0.0, 2.0)
-    check_stays_at_rest(world, lambda: topic_pub(world, "rmw", "speed", FAST, 3.0))
-
-
-def test_topic_pub_once_of_a_zero_by_the_bridge_arms_after_a_second(world: World) -> None:
-    topic_pub(world, "bridge", "zero", 0.0, 0.1)
-    world.run(1.0)
-    drives(world, lambda: topic_pub(world, "bridge", "speed", FAST, 1.0))
 
 
 # drive.py

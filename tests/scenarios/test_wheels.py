@@ -337,12 +337,3 @@ def test_a_robot_that_still_rolls_after_a_lost_link_is_a_runaway(world: World) -
         world.port.plug(mcu)
         world.run(2.0)
     assert world.state.code == "wheel_runaway"
-
-
-def test_a_runaway_that_is_cleared_while_it_lasts_is_detected_again(world: World) -> None:
-    world.drive(0.5, seconds=1.0)
-    with world.mcu.pushed(0.5):
-        world.run(2.5)
-        assert world.call("clear").success
-        world.run(1.0)
-        assert world.state.mode == "fault"
