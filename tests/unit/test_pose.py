@@ -174,25 +174,26 @@ def roll(feedback: Feedback, *skipped: Feedback) -> Rolled:
 
 
 @each(
-    ("rolled", "angle", "seconds", "filled", "unknown"),
+    ("lines", "angle", "seconds", "filled", "unknown"),
     [
         # A gap has the mean of the speeds at its ends. Counts need no filling; whole counts are of
         # the line alone.
-        (roll(line(20.0, 0.31, bridged=0.3)), 15 * 0.3 + 20 * 0.01, 0.31, 0.3, 0.0),
-        (roll(line(20.0, 0.31, bridged=0.3, turned=(7.0,) * 4)), 7.0, 0.31, 0.0, 0.0),
-        (roll(line(20.0, 0.31, bridged=0.3, counted=(0.1,) * 4)), 15 * 0.3 + 0.1, 0.31, 0.3, 0.0),
+        ([line(20.0, 0.31, bridged=0.3)], 15 * 0.3 + 20 * 0.01, 0.31, 0.3, 0.0),
+        ([line(20.0, 0.31, bridged=0.3, turned=(7.0,) * 4)], 7.0, 0.31, 0.0, 0.0),
+        ([line(20.0, 0.31, bridged=0.3, counted=(0.1,) * 4)], 15 * 0.3 + 0.1, 0.31, 0.3, 0.0),
         # Skipped lines leave their time and their counts to the next one, but not for a second.
         (
-            roll(line(20.0), line(99.0, turned=(1.0,) * 4), line(99.0, 0.02)),
+            [line(20.0), line(99.0, turned=(1.0,) * 4), line(99.0, 0.02)],
             1.0 + 15.0 * 0.02 + 20.0 * 0.01, 0.04, 0.02, 0.0,
         ),
-        (roll(line(20.0), line(9.0, 0.0, gap=0.5), *[line(9.0)] * 101), 0.2, 0.01, 0.0, 1.51),
-        (roll(line(20.0), line(9.0, counted=(5.0,) * 4)), 0.15 + 0.2, 0.02, 0.01, 0.0),
+        ([line(20.0), line(9.0, 0.0, gap=0.5), *[line(9.0)] * 101], 0.2, 0.01, 0.0, 1.51),
+        ([line(20.0), line(9.0, counted=(5.0,) * 4)], 0.15 + 0.2, 0.02, 0.01, 0.0),
     ],
 )  # fmt: skip
 def test_how_far_a_line_rolls(
-    rolled: Rolled, angle: float, seconds: float, filled: float, unknown: float
+    lines: list[Feedback], angle: float, seconds: float, filled: float, unknown: float
 ) -> None:
+    rolled = roll(*lines)
     assert rolled.angles == pytest.approx((angle,) * 4)
     times = rolled.seconds, rolled.filled, rolled.unknown
     assert times == pytest.approx((seconds, filled, unknown))
