@@ -118,25 +118,30 @@ def test_a_negative_variance_is_refused() -> None:
         )
 
 
-class Daemon:
-    def __init__(self) -> None:
-        self.told, self.counters, self.events = GyroFollower(), Counter[str](), list[Event]()
+S = SILENCE_TIMEOUT_NS
+STORIES = [
+    [(0, "one", "used"), (S // 2, "other", "refused"), (S - 1, "one", "used"),
+     (2 * S - 2, "other", "refused"), (2 * S, "other", "anew"), (2 * S + 1, "one", "refused")],
+    [(0, "one", "used"), (10 * S, "one", "used")],
+    [(0, "", "used"), (1, "abc", "refused"), (2 * S, "abc", "anew"), (2 * S + 1, "abc", "used")],
+]  # fmt: skip
+"""Times and senders of samples; each is refused or used, or is the first of another gyro."""
 
-    def hears(self, rate: float, at_ns: int, sender: str) -> bool:
-        sample = self.told.receive(turning(rate, at_ns, sender), self.counters, self.events)
-        assert sample is None or sample.rate == rate
-        return sample is not None
 
-
-def test_the_first_of_two_gyros_is_followed_until_it_is_silent() -> None:
-    daemon = Daemon()
-    assert daemon.hears(0.1, 0, "one")
-    assert not daemon.hears(0.2, SILENCE_TIMEOUT_NS // 2, "other")
-    assert daemon.hears(0.1, SILENCE_TIMEOUT_NS - 1, "one")
-    assert not daemon.hears(0.2, 2 * SILENCE_TIMEOUT_NS - 2, "other")
-    assert daemon.counters == {"imu_second_sender": 2}
-    assert daemon.hears(0.2, 2 * SILENCE_TIMEOUT_NS, "other")
-    assert not daemon.hears(0.1, 2 * SILENCE_TIMEOUT_NS + 1, "one")
+@each("story", STORIES)
+def test_the_first_of_two_gyros_is_followed_until_it_is_silent(
+    story: list[tuple[int, str, str]],
+) -> None:
+    gyro, counters = GyroFollower(), Counter[str]()
+    gyro.receive(REFUSED["out_of_range"], counters, [])  # takes no place
+    for at_ns, sender, expected in story:
+        # On an rmw key only the attachment names the sender.
+        sample = replace(turning(0.1, at_ns, sender), via="native" if sender else "rmw")
+        found = gyro.receive(sample, counters, [])
+        assert (found is None) == (expected == "refused")
+        assert found is None or found.anew == (expected == "anew")
+    refused = sum(expected == "refused" for *_, expected in story)
+    assert counters["imu_second_sender"] == refused
 
 
 def test_two_frames_of_senders_without_a_name_are_two_gyros() -> None:
@@ -156,42 +161,6 @@ def test_two_frames_of_senders_without_a_name_are_two_gyros() -> None:
         "a sender without a name (frame lidar_imu) sends gyro samples, but the daemon already uses "
         "those of a sender without a name (frame imu_link): end one of the two programs"
     )
-
-
-def test_the_first_sample_of_another_gyro_is_marked_as_new() -> None:
-    follower, marks = GyroFollower(), []
-    arrivals = [
-        (0, "one"),
-        (1, "one"),
-        (SILENCE_TIMEOUT_NS + 1, "other"),
-        (SILENCE_TIMEOUT_NS + 2, "other"),
-    ]
-    for at_ns, sender in arrivals:
-        sample = follower.receive(turning(0.1, at_ns, sender), Counter(), [])
-        assert sample is not None
-        marks.append(sample.anew)
-    assert marks == [False, False, True, False]
-
-
-def test_a_gyro_that_returns_after_a_silence_is_not_marked_as_new() -> None:
-    follower = GyroFollower()
-    for at_ns in (0, 10 * SILENCE_TIMEOUT_NS):
-        sample = follower.receive(turning(0.1, at_ns, "one"), Counter(), [])
-        assert sample == GyroSample(at_ns, None, 0.1)
-
-
-def test_a_gyro_after_one_without_a_name_is_marked_as_new() -> None:
-    gyro, counters, events = GyroFollower(), Counter[str](), list[Event]()
-    # On an rmw key only the attachment names the sender.
-    nameless = replace(turning(0.1, 0, ""), via="rmw")
-    first = gyro.receive(nameless, counters, events)
-    assert first is not None
-    assert not first.anew
-    assert gyro.receive(turning(0.1, 1, "abc"), counters, events) is None
-    assert "uses those of a sender without a name" in events[0].text
-    second = gyro.receive(turning(0.1, 2 * SILENCE_TIMEOUT_NS, "abc"), counters, events)
-    assert second is not None
-    assert second.anew
 
 
 def test_a_second_gyro_without_a_name_is_refused_in_words() -> None:
@@ -219,9 +188,3 @@ def test_a_robot_with_its_own_gyro_never_follows_another_one() -> None:
     )
     assert counters == {"imu_second_sender": 3}
     assert "simulat" in events[0].text
-
-
-def test_a_refused_sample_does_not_occupy_the_place_of_the_gyro() -> None:
-    daemon = Daemon()
-    daemon.told.receive(REFUSED["out_of_range"], daemon.counters, daemon.events)
-    assert daemon.hears(0.1, 8, "other")
