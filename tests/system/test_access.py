@@ -49,6 +49,8 @@ class Place:
     table: tuple[Row, ...] = ()
     robots: list[Bus]
     """Plain clients on the machine of each robot."""
+    watches = "local"
+    """The identity of the witness."""
 
     def __init__(self, where: Path) -> None:
         self.where, self.stack = where, ExitStack()
@@ -57,7 +59,7 @@ class Place:
     def __enter__(self) -> Place:
         try:
             self.open()
-            self.witness = self.stack.enter_context(zenoh.open(self.config("maintainer")))
+            self.witness = self.stack.enter_context(zenoh.open(self.config(self.watches)))
             keys = {f"{robot.root}/{key}" for robot in self.robots for key in VALUES}
             keys |= {"odom", "tf_static", ros.rmw_key("odom", ros.ODOMETRY)}
             self._watching = [self.witness.declare_subscriber(k, self._judge) for k in keys]
@@ -140,12 +142,16 @@ class Place:
                 outcome |= visitor.answered(calls)
                 self.restored()
                 return outcome
-            attempt = visitor.followed if verb == "subscribe" else partial(visitor.put, verb)
             # Try all rows that should have no effect at once, and one by one only if something
             # happened.
             idle = [row for row in rows if identity not in row.who]
-            quiet = idle if idle and not attempt(idle) else []
-            return {row: row not in quiet and attempt([row]) for row in rows}
+            if verb == "subscribe":
+                quiet = idle if idle and not any(visitor.followed([idle])) else []
+                rest = [row for row in rows if row not in quiet]
+                results = visitor.followed([[row] for row in rest])
+                return dict.fromkeys(quiet, False) | dict(zip(rest, results, strict=True))
+            quiet = idle if idle and not visitor.put(verb, idle) else []
+            return {row: row not in quiet and visitor.put(verb, [row]) for row in rows}
 
 
 def released(robot: Bus) -> bool:
@@ -178,6 +184,7 @@ class AtRouter(Place):
     """A fleet's router with two robots. `robot2` is also any client with its certificate."""
 
     table = with_deletes(at_router("acsard/robot1", "acsard/robot2"))
+    watches = "maintainer"
 
     def open(self) -> None:
         self.fleet = self.stack.enter_context(Fleet(self.where))
@@ -282,18 +289,21 @@ class Visitor:
                 self._place.comes_true(partial(look, row), 100)
         return outcome
 
-    def followed(self, rows: Sequence[Row]) -> bool:
-        """Return whether any of these subscriptions received a sample."""
-        event, place = threading.Event(), self._place
+    def followed(self, groups: Sequence[Sequence[Row]]) -> list[bool]:
+        """Return for each group of subscriptions whether any of them received a sample.
 
-        def on_sample(sample: zenoh.Sample) -> None:
-            event.set()
-
-        # Use a session of its own: within one session, every subscription gets the samples that any
-        # of them requested.
-        with zenoh.open(place.config(self._who)) as session:
-            subscribers = [subscribed(session, row, on_sample) for row in rows]
-            self._behind(session)
+        Each group has a session of its own: within one session, every subscription gets the samples
+        that any of them requested.
+        """
+        place, rows = self._place, [row for group in groups for row in group]
+        events = [threading.Event() for _ in groups]
+        with ExitStack() as stack:
+            for group, event in zip(groups, events, strict=True):
+                session = stack.enter_context(zenoh.open(place.config(self._who)))
+                for row in group:
+                    subscriber = subscribed(session, row, partial(heard, event))
+                    stack.callback(subscriber.undeclare)
+                self._behind(session)
             here = place.robots[0]
             if any(row.stirred for row in rows):
                 for key in ("cmd/app", "cmd/app/operator"):
@@ -306,10 +316,13 @@ class Visitor:
                 for robot in place.robots:
                     for verb in ("deactivate", "activate"):
                         assert robot.get(f"srv/{verb}")["success"]
-            done = place.comes_true(event.is_set, self._patience(rows))
-            for subscriber in subscribers:
-                subscriber.undeclare()
-        return done
+            for group, event in zip(groups, events, strict=True):
+                place.comes_true(event.is_set, self._patience(group))
+        return [event.is_set() for event in events]
+
+
+def heard(event: threading.Event, sample: zenoh.Sample) -> None:
+    event.set()
 
 
 def subscribed(session: zenoh.Session, row: Row, take: Callable[[zenoh.Sample], None]) -> Any:
