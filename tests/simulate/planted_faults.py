@@ -865,14 +865,13 @@ FAULTS = (
     ),
     fault(
         "odometry silent",
-        "the pose goes on at the last speed while the board is silent",
+        "the pose goes on at 0.1 m/s while the board is silent",
         ROBOT,
-        "        if not feedback:\n            return ()",
-        "        if not feedback:\n"
-        '            if link != "up" and session.good_lines:\n'
-        "                pose, far = self._odometry.pose, 0.01 * self._odometry.twist.linear\n"
-        "                self._odometry.pose = replace(pose, x=pose.x + far)\n"
-        "            return ()",
+        "        pressed = last.left_ns < last.pressed_ns\n",
+        "        pressed = last.left_ns < last.pressed_ns\n"
+        '        if self.session.link != "up" and self.session.good_lines:\n'
+        "            pose = self._odometry.pose\n"
+        "            self._odometry.pose = replace(pose, x=pose.x + 0.001)\n",
     ),
     fault(
         "odometry endless",
