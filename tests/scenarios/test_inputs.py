@@ -1,4 +1,4 @@
-"""Clients send commands, wait or are refused, and `state` always gives the reason."""
+"""What arrives is taken or refused as a whole and counted, and `state` gives the reason."""
 
 from __future__ import annotations
 

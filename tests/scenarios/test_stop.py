@@ -1,4 +1,4 @@
-"""Clients send commands, wait or are refused, and `state` always gives the reason."""
+"""A stop latches and brakes hard; deactivated or ending, the robot ramps down and obeys nobody."""
 
 from __future__ import annotations
 

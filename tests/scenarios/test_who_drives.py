@@ -121,7 +121,7 @@ def test_a_sender_that_was_silent_for_ten_seconds_must_send_a_zero_again(way: Wa
 def test_a_zero_that_was_too_early_to_be_proven_arms_nothing_behind_ten_seconds_of_silence(
     way: Way,
 ) -> None:
-    """One zero and the first speed 10 min later moved the robot by 1.09 m."""
+    """Without this rule, a zero and a first speed ten minutes later moved the robot by 1.09 m."""
     world = quiet()
     speaker = Speaker(world, way)
     speaker.send(0.0)
@@ -133,7 +133,7 @@ def test_a_zero_that_was_too_early_to_be_proven_arms_nothing_behind_ten_seconds_
 
 
 def test_two_programs_with_a_gid_of_zeros_never_arm_each_other() -> None:
-    """They drove the robot by 2.18 m."""
+    """Without this rule, they drove the robot by 2.18 m."""
     world = quiet()
     one, other = (Speaker(world, "rmw", "\0" * 16) for _ in range(2))
     since_ns = world.now_ns

@@ -1,4 +1,4 @@
-"""Clients send commands, wait or are refused, and `state` always gives the reason."""
+"""Of several sources the highest drives; of several senders of one source, the first."""
 
 from __future__ import annotations
 

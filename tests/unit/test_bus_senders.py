@@ -161,9 +161,10 @@ def test_the_clock_of_a_header_is_kept_apart_from_that_of_a_stamping_router() ->
         at_ns = ARRIVED_NS + step * 50_000_000
         now_ns = SENT_NS + step * 50_000_000
         slow = stamped(*divmod(now_ns - 10**9, 10**9))
-        for body, key in ((twist(), "cmd/nav"), (slow, "cmd/teleop")):
+        for body in (twist(), slow):
             sample = replace(
-                by_ros("bridge", body, key=key, stamp_ns=now_ns, sender="router"), arrived_ns=at_ns
+                by_ros("bridge", body, key="cmd/nav", stamp_ns=now_ns, sender="router"),
+                arrived_ns=at_ns,
             )
             refused = arbiter.accept(RECEIVER.command(sample), CommandsConfig())
             reasons.append("" if refused is None else refused.what)
