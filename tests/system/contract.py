@@ -210,7 +210,7 @@ def refused(door: Door, code: str, send: Callable[[], object]) -> None:
     send()
     until(lambda: door.counted(code) > counted, 3.0, f"counted as {code}")
     goes_on(door.bus, 5)
-    after = door.bus.state()
+    after = door.bus.at_rest()  # on a busy machine the board may just be silent
     assert changes(before, after).keys() <= {f"command_{code}"}, code
     for part in ("x", "y", "yaw", "linear", "angular", "wheels"):
         assert after[part] == before[part], (code, part)

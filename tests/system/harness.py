@@ -833,7 +833,7 @@ class Bus:
 
         def look() -> Any:
             state = self.state()
-            return state if state["mode"] == "ready" and not any(state["wheels"]) else None
+            return state if state["mode"] == "ready" and set(state["wheels"]) == {0.0} else None
 
         return until(look, within, "at rest")
 
