@@ -205,7 +205,7 @@ def main_tokens(args: argparse.Namespace) -> int:
     from acsard.terminal.output import show, table
 
     vault = _vault(args, _loaded(args)[1])
-    tokens, now_s = vault.all(), time.time()
+    tokens, now_s = vault.all(), vault.now_s()
 
     def until(ends: int) -> str:
         left = f"{lasting(60 * round((ends - now_s) / 60))} left" if ends > now_s else "ended"

@@ -23,6 +23,7 @@ from msgspec import Struct
 from msgspec.structs import asdict
 
 from acsard.core.values import ROLES, Role
+from acsard.host import clock
 from acsard.host.atomic_file import replace
 from acsard.host.errors import MSGSPEC_ERRORS, MendableError, NotPermittedError, UsageError
 from acsard.web.callers import AdmittedClient
@@ -34,6 +35,9 @@ SERVICE_DIRECTORY = Path("/var/lib/acsard-web")
 
 # of one robot
 MAX_TOKENS = 200
+
+# Of the time in the token file: more writes would wear out an SD card.
+TIME_PERIOD_S = 60
 
 
 class Token(Struct, frozen=True):
@@ -49,17 +53,25 @@ class Token(Struct, frozen=True):
 
 class _File(Struct, frozen=True):
     tokens: list[dict[str, Any]]  # a record that is not a valid `Token` is kept and admits nobody
+    newest: int = 0  # the newest time that a server or an invitation has seen, s since 1970
 
 
 class Vault:
     """The access tokens of one robot. The token file also contains tokens of other robots.
 
-    The clock of a robot without a battery may begin in 1970 at each start. A token that expired
-    while the server ran stays expired, because the server deleted it.
+    The clock of a robot without a battery may begin in 1970 at each start. So the file contains the
+    newest time that was seen, and a token expires by the later of the clock and this time, which
+    goes on while the server runs.
     """
 
     def __init__(self, directory: Path, robot: str) -> None:
         self.path, self.robot = directory / FILE, robot
+        self._newest_s = math.inf  # of the file; without a file no time is stored
+        self._offset_s = -math.inf  # from the steady clock to the newest time
+
+    def now_s(self) -> float:
+        """Return the later of the clock and the newest time at the last reading of the file, s."""
+        return max(time.time(), clock.steady_s() + self._offset_s)
 
     def all(self) -> list[Token]:
         """Return this robot's tokens, also expired ones; [] if the file cannot be read."""
@@ -69,14 +81,13 @@ class Vault:
             return []
 
     def valid(self) -> list[Token]:
-        """Return the tokens that are valid now, and delete the expired ones."""
-        tokens, now_s = self.all(), time.time()
-        valid = [token for token in tokens if token.ends > now_s]
-        if len(valid) < len(tokens):
+        """Return the tokens that are valid now, and store the time in the file if that is due."""
+        tokens, now_s = self.all(), self.now_s()
+        if now_s >= self._newest_s + TIME_PERIOD_S:
             # Without room on the disk, the tokens expire by the clock alone.
             with suppress(MendableError, NotPermittedError, UsageError), self._changing():
                 pass
-        return valid
+        return [token for token in tokens if token.ends > now_s]
 
     def unknown_to(self, service: Path = SERVICE_DIRECTORY) -> str:
         """Return a warning if the service `acsard-web` reads another token file, else ""."""
@@ -93,7 +104,7 @@ class Vault:
         Raises `UsageError` for a name in use, or for too many tokens.
         """
         with self._changing() as rows:
-            now_s = int(time.time())
+            now_s = int(self.now_s())
             ours = self._own(rows)
             if any(record.name == name for record in ours):
                 raise UsageError(
@@ -134,7 +145,10 @@ class Vault:
     def _load(self) -> tuple[dict[str, Any], _File]:
         # Fields that only a later version knows are written back.
         raw = msgspec.json.decode(self.path.read_bytes(), type=dict[str, Any])
-        return raw, msgspec.convert(raw, _File)
+        file = msgspec.convert(raw, _File)
+        self._newest_s = file.newest
+        self._offset_s = max(self._offset_s, file.newest - clock.steady_s())
+        return raw, file
 
     @contextmanager
     def _changing(self) -> Iterator[list[dict[str, Any]]]:
@@ -149,9 +163,10 @@ class Vault:
                     raw, file = self._load()
                 except FileNotFoundError:
                     raw, file = {}, _File([])
-                tokens = [token for token in file.tokens if not _has_expired(token)]
-                yield tokens
-                self._write(raw | {"tokens": tokens})
+                now_s = self.now_s()
+                rows = [row for row in file.tokens if not _has_expired(row, now_s)]
+                yield rows
+                self._write(raw | {"tokens": rows, "newest": int(now_s)})
             finally:
                 os.close(handle)
         except PermissionError:
@@ -222,7 +237,7 @@ class ReadTokens:
     def left_s(self, digest: str) -> int:
         """Return the time until a token expires; 0 if it is not valid."""
         token = self._known.get(digest)
-        return 0 if token is None else max(0, math.ceil(token.ends - time.time()))
+        return 0 if token is None else max(0, math.ceil(token.ends - self._vault.now_s()))
 
 
 def _token(row: dict[str, Any]) -> Token | None:
@@ -232,9 +247,9 @@ def _token(row: dict[str, Any]) -> Token | None:
         return None
 
 
-def _has_expired(row: dict[str, Any]) -> bool:
+def _has_expired(row: dict[str, Any], now_s: float) -> bool:
     token = _token(row)
-    return token is not None and token.ends <= time.time()
+    return token is not None and token.ends <= now_s
 
 
 def _digest(text: str) -> str:

@@ -13,6 +13,7 @@ import msgspec
 import pytest
 from msgspec.structs import replace
 
+from acsard.host import clock
 from acsard.host.errors import MendableError, NotPermittedError, UsageError
 from acsard.web import tokens
 from acsard.web.callers import AdmittedClient
@@ -101,32 +102,113 @@ def test_a_role_and_a_field_of_a_later_version_leave_the_other_tokens_valid(tmp_
     assert (row["name"], row["later"], content["later"]) == ("phone", 1, 2)
 
 
-def test_an_expired_token_is_deleted_so_it_stays_expired_after_a_start_without_the_time(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+class Clocks:
+    """The clocks of a robot without a battery, whose wall clock begins in 1970 at each start."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.wall_s, self.steady_s = 1_800_000_000.0, 1000.0
+        monkeypatch.setattr(time, "time", lambda: self.wall_s)
+        monkeypatch.setattr(clock, "steady_s", lambda: self.steady_s)
+
+    def advance(self, seconds: float) -> None:
+        self.wall_s += seconds
+        self.steady_s += seconds
+
+    def restart(self) -> None:
+        self.wall_s = self.steady_s = 5.0
+
+
+@pytest.fixture
+def clocks(monkeypatch: pytest.MonkeyPatch) -> Clocks:
+    return Clocks(monkeypatch)
+
+
+DAY_S = 86_400
+
+
+def test_a_token_that_expired_stays_expired_after_a_start_without_the_time(
+    tmp_path: Path, clocks: Clocks
 ) -> None:
-    now_s = 1_800_000_000.0
-    monkeypatch.setattr(time, "time", lambda: now_s)
-    vault = Vault(tmp_path, "robot1")
-    text, token = vault.invite("maintainer", "me", 1)
-    other, _ = vault.invite("viewer", "tv", 30)
-    now_s = token.ends - 0.1
-    assert owner(vault, text) is not None
-    now_s = token.ends
-    assert owner(vault, text) is None
-    now_s = 5.0  # a clock without a battery begins in 1970
+    server = Vault(tmp_path, "robot1")
+    text, token = server.invite("maintainer", "me", 1)
+    other, _ = server.invite("viewer", "tv", 30)
+    for _ in range(25):
+        assert (owner(server, text) is not None) is (clocks.wall_s < token.ends)
+        clocks.advance(3600.0)
+    clocks.restart()
     server = Vault(tmp_path, "robot1")
     assert owner(server, text) is None
     assert read(server).left_s(token.digest) == 0
+    # A robot without a network never learns the time, and its valid tokens still work.
     assert owner(server, other) is not None
 
 
-def test_a_disk_that_cannot_delete_a_token_leaves_the_others_valid(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+def test_without_the_time_a_token_is_valid_only_for_its_days_of_running(
+    tmp_path: Path, clocks: Clocks
+) -> None:
+    text, _ = Vault(tmp_path, "robot1").invite("maintainer", "me", 1)
+    valid = list[bool]()
+    for _ in range(3):  # starts, each of which runs for 10 hours and 1 minute
+        clocks.restart()
+        server = Vault(tmp_path, "robot1")
+        for _ in range(10):
+            valid.append(owner(server, text) is not None)
+            clocks.advance(3600.0)
+        owner(server, text)
+        clocks.advance(59.0)  # not written yet, so lost
+    assert sum(valid) == 24
+    assert not valid[-1]
+
+
+def test_an_expired_token_is_refused_while_the_server_runs_without_reading_the_file(
+    tmp_path: Path, clocks: Clocks
+) -> None:
+    text, token = Vault(tmp_path, "robot1").invite("maintainer", "me", 1)
+    clocks.restart()
+    tokens = read(Vault(tmp_path, "robot1"))  # and never again
+    assert tokens.left_s(token.digest) == DAY_S
+    clocks.advance(DAY_S)
+    assert tokens.owner([text]) is None
+
+
+def test_an_invitation_without_the_time_is_valid_for_its_days_after_the_clock_is_set(
+    tmp_path: Path, clocks: Clocks
+) -> None:
+    Vault(tmp_path, "robot1").invite("viewer", "tv", 30)
+    now_s = clocks.wall_s
+    clocks.restart()
+    text, token = Vault(tmp_path, "robot1").invite("operator", "phone", 1)
+    assert token.ends - now_s == DAY_S
+    server = Vault(tmp_path, "robot1")
+    assert owner(server, text) is not None
+    clocks.wall_s = now_s + 3600.0  # the network has come
+    assert owner(server, text) is not None
+
+
+def test_the_time_is_written_each_minute_at_most_and_never_without_a_file(
+    tmp_path: Path, clocks: Clocks
+) -> None:
+    server = Vault(tmp_path, "robot1")
+    for _ in range(100):
+        digests(server)
+        clocks.advance(1.0)
+    assert not server.path.exists()
+    Vault(tmp_path, "robot1").invite("viewer", "tv", 1)
+    contents = set[bytes]()
+    for _ in range(600):
+        digests(server)
+        contents.add(server.path.read_bytes())
+        clocks.advance(1.0)
+    assert len(contents) == 10
+
+
+def test_a_disk_that_cannot_store_the_time_leaves_the_tokens_valid(
+    tmp_path: Path, clocks: Clocks, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     vault = Vault(tmp_path, "robot1")
     _, ended = vault.invite("viewer", "guest", 1)
     _, token = vault.invite("viewer", "tv", 2)
-    monkeypatch.setattr(time, "time", lambda: float(ended.ends))
+    clocks.advance(ended.ends - clocks.wall_s)
 
     def full(*_: object, **__: object) -> None:
         raise OSError(errno.ENOSPC, "No space left on device")
