@@ -1,8 +1,9 @@
 """Connects to the daemon of the page's robot, follows its state and the keys of the viewers, and
 detects silence.
 
-This work has a thread of its own, which may wait for the bus. The event loop reads its results. A
-query has another thread: a daemon that hangs lets it wait for seconds, and its silence must show.
+This work has a thread of its own, which may wait for the bus. The event loop reads its results, and
+judges the silence by the time of the last state, because the thread itself may hang. A query has
+another thread: a daemon that hangs lets it wait for seconds.
 """
 
 from __future__ import annotations
@@ -100,12 +101,33 @@ class FollowedRobot:
         self.about = about
         self.client: Connection | None = None
         self.streams = Streams()
-        # why the robot is not reachable, or ""
-        self.gone = f"no daemon answers at {address.endpoint} yet"
+        self._not_connected = f"no daemon answers at {address.endpoint} yet"
+        self._watch: Watch | None = None
         self.state: RobotState | None = None  # the newest one
         self.path = PathHistory()  # in the odom frame
         self._connect, self._counts = connect, counts
         self._about_due_s, self._is_leaving = 0.0, False
+
+    @property
+    def gone(self) -> str:
+        """Why the robot is not reachable, or ""."""
+        watch = self._watch
+        if watch is None:
+            return self._not_connected
+        is_silent = watch.silent(clock.steady_s())
+        if is_silent and watch.unreadable:
+            return (
+                "the daemon's state cannot be read: does the daemon run another version of "
+                "acsard? Use the same version here"
+            )
+        if not watch.is_confirmed:
+            return self._not_connected
+        if is_silent:
+            return (
+                f"nothing is received from the daemon at {self.endpoint}: does the "
+                "daemon run? `acsard doctor` on the robot finds the cause"
+            )
+        return ""
 
     async def run(self) -> None:
         """Follow the robot until cancelled. Raises `MendableError` if it cannot be followed."""
@@ -123,9 +145,10 @@ class FollowedRobot:
             try:
                 self.client = self._connect()
             except UnreachableError as error:
-                self.gone = str(error)
+                self._not_connected = str(error)
                 time.sleep(RETRY_DELAY_S)
         watch, query = Watch(self.client, clock.steady_s()), None
+        self._watch = watch
         while not self._is_leaving:
             self.streams.update(self.client)
             now = clock.steady_s()
@@ -139,7 +162,7 @@ class FollowedRobot:
             time.sleep(PROCESS_PERIOD_S)
 
     def _look(self, watch: Watch, now: float) -> None:
-        unreadable = watch.unreadable
+        was_gone, unreadable = bool(self.gone), watch.unreadable
         with suppress(zenoh.ZError):  # the session is closed, so the robot is silent
             for state in watch.poll(now):
                 if restarted(self.state, state):
@@ -148,19 +171,7 @@ class FollowedRobot:
                 self.state = state
         if watch.unreadable > unreadable:
             self._counts.add("unreadable", watch.unreadable - unreadable)
-        quiet = watch.silent(now)
-        if quiet and watch.unreadable:
-            self.gone = (
-                "the daemon's state cannot be read: does the daemon run another version of "
-                "acsard? Use the same version here"
-            )
-        elif quiet and (watch.is_confirmed or not self.gone):
-            self.gone = (
-                f"nothing is received from the daemon at {self.endpoint}: does the "
-                "daemon run? `acsard doctor` on the robot finds the cause"
-            )
-        elif watch.is_confirmed and not quiet and self.gone:
-            self.gone = ""
+        if was_gone and not self.gone:
             self.refresh_about()
 
     def _query_about(self, client: Connection) -> None:

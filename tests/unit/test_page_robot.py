@@ -65,7 +65,7 @@ class World:
         `publishes` returns the sample that the robot publishes at a time, or None.
         """
         changes: list[tuple[float, str]] = []
-        watch = Watch(cast(Any, self.robot), self.now)
+        watch = self.followed._watch = Watch(cast(Any, self.robot), self.now)
         began, before = self.now, self.followed.gone
         while self.now - began < seconds:
             if (sample := publishes(self.now - began)) is not None:
@@ -92,8 +92,10 @@ class Answering(Robot):
 
 
 @pytest.fixture
-def world() -> World:
-    return World()
+def world(monkeypatch: pytest.MonkeyPatch) -> World:
+    result = World()
+    monkeypatch.setattr(clock, "steady_s", lambda: result.now)
+    return result
 
 
 def test_a_robot_that_falls_silent_is_reported_within_its_time(world: World) -> None:
@@ -190,6 +192,38 @@ async def test_a_query_that_hangs_does_not_hide_the_silence_of_its_robot(
             await asyncio.sleep(0.01)
     running.cancel()
     answers.set()
+
+
+@pytest.mark.parametrize("method", ["update", "poll"])
+async def test_a_bus_that_hangs_does_not_hide_the_silence_of_its_robot(
+    method: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    hangs, ends = threading.Event(), threading.Event()
+    owner: Any = Streams if method == "update" else Watch
+    work = getattr(owner, method)
+
+    def hanging(*args: Any) -> Any:
+        if hangs.is_set():
+            ends.wait(20.0)
+        return work(*args)
+
+    monkeypatch.setattr(owner, method, hanging)
+    client = AnsweringRobot(failures=0)
+    client.queue.append(sample_of(STATE))
+    page = FollowedRobot(
+        Address("tcp/x:1", "acsar", ""), lambda: cast(Any, client), ABOUT, Counts()
+    )
+    running = asyncio.create_task(page.run())
+    try:
+        async with asyncio.timeout(10.0):
+            while page.gone:
+                await asyncio.sleep(0.01)
+            hangs.set()
+            while not page.gone:
+                await asyncio.sleep(0.01)
+    finally:
+        running.cancel()
+        ends.set()
 
 
 def test_the_path_keeps_ten_minutes_a_bounded_number_of_points_and_the_newest_place() -> None:
