@@ -108,8 +108,18 @@ def require_certificate(listen: Sequence[Listen], tls: str) -> None:
 def open_sockets(listen: Sequence[Listen], next_port: bool) -> list[tuple[Listen, socket.socket]]:
     """Open a listening socket at each address; return pairs of the used address and the socket.
 
-    If `next_port` is true, the next free port of `MAX_PORTS_TRIED` is used. Raises `InUseError`.
+    If `next_port` is true, the next free port of `MAX_PORTS_TRIED` is used. Raises `InUseError`,
+    and `UsageError` for another address at the port of `[::]`, which listens at all addresses.
     """
+    for everywhere in listen:
+        if everywhere.host != EVERYWHERE_6:
+            continue
+        for other in listen:
+            if other.port == everywhere.port and other != everywhere:
+                raise UsageError(
+                    f"[::]:{other.port} listens at all addresses of this machine, IPv4 too: list "
+                    f"it alone, without {other.host}:{other.port}, or choose another port"
+                )
     return [_open_socket(address, next_port) for address in listen]
 
 

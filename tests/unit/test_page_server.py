@@ -111,6 +111,15 @@ def test_a_port_in_use_is_reported_or_the_next_port_is_used() -> None:
             assert endpoint.port > wished.port
 
 
+@pytest.mark.parametrize("texts", [("0.0.0.0", "[::]"), ("[::]", "127.0.0.1")])
+def test_an_address_at_the_port_of_the_ipv6_wildcard_is_reported(
+    texts: tuple[str, str],
+) -> None:
+    port = free_port()
+    with pytest.raises(UsageError, match=rf"^\[::\]:{port} .* IPv4 too: list it alone, without \d"):
+        open_sockets([parse_listen(f"https://{text}:{port}") for text in texts], next_port=True)
+
+
 def test_https_without_a_certificate_is_reported_and_http_needs_none(tmp_path: Path) -> None:
     away, here = parse_listen("https://0.0.0.0:8443"), parse_listen("http://127.0.0.1:8080")
     require_certificate([here], "")
