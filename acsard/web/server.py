@@ -189,17 +189,24 @@ class Certificate:
         self._files = CertificateFiles(*files_in(directory))
         self.names = set[str]()
         self.context = self._load()
+        self._trouble = ""  # of the last attempt to load new files
 
     def read(self) -> None:
-        """Load the files if they were replaced. Open connections keep the old certificate."""
-        if not self._files.renewed():
+        """Load the files if they were replaced. Open connections keep the old certificate.
+
+        A failed attempt is repeated at each call. Its cause is reported once.
+        """
+        if not self._files.renewed() and not self._trouble:
             return
         try:
             self.context = self._load()
         except (OSError, ValueError) as error:
             text = f"the page cannot use its new TLS certificate: {error}"
-            self._log.event(Event("configuration", text, "warning"))
+            if text != self._trouble:
+                self._log.event(Event("configuration", text, "warning"))
+            self._trouble = text
         else:
+            self._trouble = ""
             text = "the page uses its new TLS certificate and keeps its open connections"
             self._log.info("configuration", text=text)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import errno
 import io
 import os
 import socket
@@ -174,6 +175,36 @@ async def test_one_thread_waits_for_a_hanging_disk_and_then_everything_is_read_a
     finally:
         reading.cancel()
         log.close()
+
+
+def test_a_new_certificate_that_cannot_be_loaded_is_tried_again_and_reported_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(certificate_watch, "FILES_CHECK_PERIOD_NS", 0)
+    authority = Authority.make(tmp_path, "test", 10)
+    authority.issue(tmp_path, "robot", ["192.168.0.1"], 10)
+    lines = io.StringIO()
+    log = Log(LogConfig(), lines)
+    certificate = Certificate(str(tmp_path), log)
+    load = certificate._load
+
+    def out_of_files() -> None:
+        raise OSError(errno.EMFILE, "Too many open files")
+
+    monkeypatch.setattr(certificate, "_load", out_of_files)
+    authority.issue(tmp_path, "robot", ["192.168.0.2"], 10)
+    for _ in range(5):
+        certificate.read()
+    monkeypatch.setattr(certificate, "_load", load)
+    assert "192.168.0.2" not in certificate.names
+    before = certificate.context
+    certificate.read()
+    assert "192.168.0.2" in certificate.names
+    after = certificate.context
+    certificate.read()
+    assert before is not after is certificate.context
+    log.close()
+    assert lines.getvalue().count("cannot use its new TLS certificate") == 1
 
 
 async def test_the_connections_of_a_revoked_token_end_with_the_reading_that_misses_it(
