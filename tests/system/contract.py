@@ -107,7 +107,8 @@ def silence(door: Door) -> None:
         late = lost(silent, rest.at) + kept_waiting(door.robot.daemon.pid) - waited
         assert rest.at - silent < TIMEOUT_S + linear / 1.0 + 0.15 + late
         assert all(before >= after for before, after in pairwise(speeds)), speeds
-        assert sum(0.0 < now < linear for now in set(speeds)) > 3, speeds
+        # A computer that loses the time of the ramp is at its end when it goes on.
+        assert sum(0.0 < now < linear for now in set(speeds)) > 3 or late > 0.1, speeds
 
 
 def late(door: Door) -> None:
