@@ -95,10 +95,15 @@ def test_a_short_silence_only_ramps_up_again(world: World) -> None:
     assert world.state.mode == "driving"
 
 
-def test_a_long_silence_requires_neutral_again(world: World) -> None:
+@pytest.mark.parametrize("fault", ["mute", "partial_line", "noise"])
+def test_a_board_that_is_silent_or_cannot_be_read_for_long_requires_neutral_again(
+    world: World, fault: str
+) -> None:
     world.drive(0.5, seconds=1.0)
-    with world.mcu.mute():
+    with world.mcu.switched_on(named(fault)):
         world.hold(0.5, seconds=1.5)
+        assert world.state.mode == "waiting"
+        assert world.state.link == "stale"
     world.hold(0.5, seconds=1.0)
     assert world.state.mode == "ready"
     assert world.state.code == "neutral"
