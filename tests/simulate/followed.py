@@ -257,6 +257,11 @@ class Followed:
         longest_ns = self._witness.timeout[command.who[0]]
         return place < len(stamps_ns) and stamps_ns[place] - stamp_ns <= longest_ns
 
+    @property
+    def sender(self) -> dict[str, Any] | None:
+        """The sender of the command that the robot follows, None if that is not known."""
+        return None if self._holder is None else self._holder.sender
+
     def forget(self) -> None:
         """Note that the daemon may have forgotten all commands."""
         self._sure.clear()

@@ -73,6 +73,9 @@ TROUBLE_NS = 2 * NS
 """After another fault of the board, and after a reset, the daemon knows within this time that the
 link was lost or that the board has started again."""
 
+ASKS_NS = 3 * NS // 2
+"""Longest time for which the daemon asks a board without a check for its check."""
+
 
 class Liveness:
     """Judges that a lawful sender drives, and judges counters and memory at the end of a plan."""
@@ -105,6 +108,8 @@ class Liveness:
             for sender in run.plan["senders"]
             if sender["way"] in FOREIGN
         }
+        self._followed_ns: dict[str, int] = {}
+        """When the robot last followed each of these senders."""
 
     @property
     def event_ns(self) -> int:
@@ -204,6 +209,7 @@ class Liveness:
     def judge(self, now_ns: int) -> None:
         """Check that the robot drives if a lawful sender has sent speeds for long enough."""
         run = self.run
+        self._stays_armed(now_ns)
         if not self._since or run.active != run.lasting or run.witness.must_rest is not None:
             return
         # A `deactivate` that waits for the disk is in force before its answer.
@@ -217,6 +223,46 @@ class Liveness:
                 if now_ns - run.moved_ns > NS // 2:
                     text = f"{identity} since {since_ns / NS:.3f} s; {run.witness.reason}"
                     raise BrokenError("a lawful sender drives", now_ns, text)
+
+    def _stays_armed(self, now_ns: int) -> None:
+        """Check that a sender that the robot has followed stays armed until an event disarms it.
+
+        The robot must have followed a speed. If it follows only a zero, the sender's clock may
+        still turn out to be unproven.
+        """
+        run = self.run
+        sender = run.followed.sender
+        # Behind a stall the daemon may ask the board for its check, and finds the loss only then.
+        asks = run.witness.mode == "waiting" and now_ns < self._stall[1] + ASKS_NS
+        sole = sender is not None and self._sole_senders.get(sender["source"]) == sender["name"]
+        if sender is not None and any(run.followed.wish or ()) and sole and not asks:
+            self._followed_ns[sender["source"]] = now_ns
+        witness = run.witness
+        if witness.mode != "ready" or witness.code != "neutral" or witness.pending:
+            return
+        source = witness.source
+        if not QUIET_FAULTS.issuperset(name for name, _ in run.active[len(run.lasting) :]):
+            return
+        followed_ns = self._followed_ns.get(source, -1)
+        if now_ns - followed_ns > SILENT_NS - witness.timeout.get(source, 0):
+            return
+        if followed_ns > max(self._disarmed_ns, self._stall[1]) + self._tick_ns:
+            text = f"{source} was followed at {followed_ns / NS:.3f} s; {witness.reason}"
+            raise BrokenError("an armed sender stays armed", now_ns, text)
+
+    @cached_property
+    def _sole_senders(self) -> dict[str, str]:
+        """Maps each source with only one sender to this sender's name. Foreign clocks are left out.
+
+        The reason in `state` names a source but no sender, so with several senders it is ambiguous.
+        """
+        names: dict[str, str] = {}
+        senders = self.run.plan["senders"]
+        for source in {sender["source"] for sender in senders} - self.run.witness.churned:
+            sender, *others = [sender for sender in senders if sender["source"] == source]
+            if not others and sender["way"] in UNSHARED and not sender.get("bad_stamps"):
+                names[source] = sender["name"]
+        return names
 
     def end(self) -> None:
         """End all faults, release all latches, and check that a lawful sender drives."""

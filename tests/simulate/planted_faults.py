@@ -21,7 +21,7 @@ class Edit(NamedTuple):
 PLANS_OF_FAULT = {
     "estop": "estop", "away": "away", "battery": "battery", "driver": "driver_fault",
     "moment": "late step", "robot set": "late step",
-    "neutral stall": "stall behind a zero", "neutral place": "stall",
+    "neutral stall": "stall behind a zero", "neutral resume": "stall",
     "driver release": "behind a press",
     "wheel press": "behind a press",
     "limits saturated": "wheel limit",
@@ -277,11 +277,11 @@ FAULTS = (
         "",
     ),
     fault(
-        "neutral place",
-        "after a stall the first sender that is read takes the robot",
+        "neutral resume",
+        "a stall of the daemon asks each sender for a zero",
         NEUTRAL,
         "            self.present_ns = now_ns\n",
-        "            pass\n",
+        "            self.arrived_ns = None\n",
     ),
     fault(
         "neutral gap",
