@@ -337,3 +337,17 @@ def test_a_robot_that_still_rolls_after_a_lost_link_is_a_runaway(world: World) -
         world.port.plug(mcu)
         world.run(2.0)
     assert world.state.code == "wheel_runaway"
+
+
+def test_a_computer_that_stutters_makes_no_fault_of_a_sound_wheel_with_counts() -> None:
+    """A line that ends a silence has the counts of all of it."""
+    world = World(
+        Config(mcu=McuConfig(link_check="on", encoder_counts=20), sim=SimConfig(encoder_counts=20))
+    )
+    world.run(0.2)
+    world.drive(0.6, seconds=1.5)
+    for number in range(120):
+        world.stall(0.1 + 0.005 * (number % 8))
+        world.send(0.6)
+        world.run(0.001 + 0.002 * (number % 7))
+        assert world.state.mode != "fault", world.state.reason

@@ -83,7 +83,9 @@ class Odometry(Struct):
             rolled, seconds = gap.angles, gap.seconds
         else:
             rolled = line.turned or line.counted or times(reported, seconds)
-        checks.check_line(model, line, rolled, seconds, known=gap is None or not gap.unknown)
+        # Counts are valid even after a silence: the wheels turned by them in its time, too.
+        whole = seconds if line.turned is None else seconds + line.gap
+        checks.check_line(model, line, rolled, whole, known=gap is None or not gap.unknown)
         turn, slips = checks.turn, checks.slips
 
         believed = wheels.believed(reported) if wheels.leaves_out else reported
