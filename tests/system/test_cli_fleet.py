@@ -90,7 +90,7 @@ COMMANDS = (
 
 VARYING = (
     (re.escape(version()), "VERSION"),
-    (r"\S+@\S+ pytest/[0-9a-f]{16}", "SENDER"),
+    (r"\S+@[^\s/]+( [^\s/]+)?/[0-9a-f]{16}", "SENDER"),
     (r"\d{4}-\d\d-\d\d [\d:]+ UTC", "TIME"),
     (r"\d+\.\d s ", "N s "),
     (r" {2,}", "  "),

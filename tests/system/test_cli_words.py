@@ -67,7 +67,7 @@ MOST = 6
 """The longest output, in lines, that is shown whole."""
 
 VARYING = (
-    (r"\S+@\S+ pytest/[0-9a-f]{16}", "SENDER"),
+    (r"\S+@[^\s/]+( [^\s/]+)?/[0-9a-f]{16}", "SENDER"),
     (r"0\.2\.0\S*(?=,? robot)", "VERSION"),
     (r"/dev/pts/\d+", "PTY"),
     (r"\d{4}-\d\d-\d\d [\d:]+ UTC", "TIME"),

@@ -141,7 +141,7 @@ def test_a_page_without_a_token_says_so_and_retries_only_after_a_press(stranger:
     assert "a token is missing" in browser.text("reason")
     # The phone was meanwhile invited in another tab.
     token = stranger.server.invite("viewer", "tab")
-    posted = "fetch('token', {method: 'POST', body: new URLSearchParams({token: 'TOKEN'})})"
+    posted = "fetch('token', {method: 'POST', body: JSON.stringify({token: 'TOKEN'})})"
     browser.js(posted.replace("TOKEN", token) + ".then(told => told.ok)")
     browser.tap("again")
     stranger.shows("role", "viewer")
