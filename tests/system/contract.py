@@ -105,10 +105,9 @@ def silence(door: Door) -> None:
         rest = applied.find(lambda m: not moving(m), 5.0, "it stands", after=silent)
         speeds = [speed(m.value) for m in applied.seen if silent < m.at <= rest.at]
         late = lost(silent, rest.at) + kept_waiting(door.robot.daemon.pid) - waited
-        assert rest.at - silent < TIMEOUT_S + linear / 1.0 + 0.15 + late
+        # The last command was up to a tenth of a second old. A busy computer may skip some speeds.
+        assert TIMEOUT_S + linear / 4 < rest.at - silent < TIMEOUT_S + linear / 1.0 + 0.15 + late
         assert all(before >= after for before, after in pairwise(speeds)), speeds
-        # A computer that loses the time of the ramp is at its end when it goes on.
-        assert sum(0.0 < now < linear for now in set(speeds)) > 3 or late > 0.1, speeds
 
 
 def late(door: Door) -> None:
