@@ -35,9 +35,9 @@ COUNT_MARGIN = 2  # each of two reports may be wrong by one
 # `feedback.wheel_speed`.
 COARSEST_COUNT = math.tau / 16
 
-MIN_COUNT_S = 0.005  # firmware rarely counts for a shorter time
+MIN_COUNT_S = 0.004  # boards that are asked more often repeat their speeds
 
-# 78.5 rad/s, below `feedback.wheel_speed` (80): above it, only counts excuse a speed.
+# 98.2 rad/s: above it, only counts excuse a speed over `feedback.wheel_speed`.
 MAX_STEP = COARSEST_COUNT / MIN_COUNT_S
 
 MAX_REPORTS = 2  # of the same count: firmware that is asked again very soon repeats its speeds once
