@@ -91,34 +91,10 @@ def test_a_change_sets_exactly_the_given_keys() -> None:
 def test_the_timeout_of_a_source_is_set_by_the_name_of_the_source() -> None:
     made, _ = changed(CONFIG, {"commands.sources.app.timeout": 0.5}, True)
     timeouts = {source.name: source.timeout for source in made.commands.sources}
-    assert timeouts == {
-        "teleop": 0.25,
-        "app": 0.5,
-        "ros2_control": 0.25,
-        "dock": 0.25,
-        "nav": 0.25,
-    }
+    assert timeouts == {source.name: 0.25 for source in CONFIG.commands.sources} | {"app": 0.5}
 
 
-def test_whole_numbers_are_accepted_as_floats() -> None:
-    made, _ = changed(
-        CONFIG,
-        {"rates.telemetry": 5, "odometry.yaw_variance_per_radian": 1},
-        True,
-    )
-    assert made.rates.telemetry == 5.0
-    assert made.odometry.yaw_variance_per_radian == 1.0
-
-
-@each(
-    "wishes",
-    [
-        {"limits.linear_speed": 1.0},
-        {"mcu.port": "sim", "robot.id": "r7"},
-        dict(KEYS),
-        {},
-    ],
-)
+@each("wishes", [{"mcu.port": "sim", "robot.id": "r7"}, dict(KEYS), {}])
 def test_setting_a_key_to_its_present_value_changes_nothing(wishes: dict[str, object]) -> None:
     assert changed(CONFIG, wishes, False) == (CONFIG, {})
 
@@ -159,21 +135,11 @@ def test_a_change_is_validated_like_the_file(
         assert problems(wishes) == judged
 
 
-def test_one_invalid_value_refuses_the_whole_change() -> None:
-    (line,) = problems({"limits.angular_speed": 2.0, "limits.linear_speed": 20.0})
-    assert "limits.linear_speed = 20.0: expected a number from 0 to 10 m/s" in line
-
-
 def test_a_rule_between_keys_refuses_one_change_but_accepts_a_consistent_pair() -> None:
     softer: dict[str, object] = {"limits.linear_deceleration": 0.15}
     assert "would take 6.7 s, but at most" in problems(softer)[0]
     made, _ = changed(CONFIG, softer | {"limits.linear_speed": 0.5}, True)
     assert made.limits.linear_deceleration == 0.15
-
-
-def test_limits_above_the_largest_feedback_speed_are_refused() -> None:
-    (line,) = problems({"limits.wheel_speed": 79.0, "limits.linear_speed": 4.0})
-    assert "feedback.wheel_speed = 80: the limits allow commands of 79.0 rad/s for a wheel" in line
 
 
 @each(
@@ -186,11 +152,7 @@ def test_limits_above_the_largest_feedback_speed_are_refused() -> None:
         ("x" * 4000, 1.0, "unknown key"),
         ("use_sim_time", True, "always uses the clock of its host"),
         ("use_sim_time", False, "leave use_sim_time false in the nodes"),
-        (
-            "mcu.port",
-            "/dev/x",
-            "this key is read only when the daemon starts: change it in acsard.toml",
-        ),
+        ("mcu.port", "/dev/x", "only when the daemon starts: change it in acsard.toml"),
     ],
 )
 def test_a_setting_that_cannot_be_set_is_reported_with_the_remedy(
