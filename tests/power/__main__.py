@@ -1,31 +1,26 @@
-"""Measures which faults of the product the tests notice, and what they noticed once.
+"""Measures which faults of the product the tests notice.
 
-    python -m tests.power compare [--minutes M] [--jobs 2]
-    python -m tests.power baseline [--anew] [--minutes M] [--jobs 2]
-    python -m tests.power mutants [--safety] [--only PATH [PATH ...]] [--sample N] [--seed 1]
-
-`baseline.json` has two scales: a fixed sample of mutants of the whole product, and each hunk of the
-500 commits before its own commit that could still be undone. For each item it names the test that
-noticed it. `not noticed` means that no test failed in 6 s of tests, the fastest first; `not
-reached`, that none executes it. Items of modules that were deleted since are not in the file.
-
-`compare` prints LOST for each item that a test noticed then and none notices now, and exits with 1
-if there is one. A change that deletes tests says for each lost item which line of the product's
-scope allows it, or adds a test. An item whose code was rewritten is gone, not lost. `baseline`
-measures the items without a result, and `--anew` all items of this tree. `--scales` and `--only`
-choose some. A run starts nothing after `--minutes`. It may be ended: it loses at most the items
-under way, and the next run goes on where it ended.
+    python -m tests.power mutants [--safety] [--only PATH [PATH ...]] [--tests PATH [PATH ...]]
+                                  [--sample N] [--seed 1] [--minutes M] [--jobs 2]
 
 A mutant has one changed, swapped or dropped piece of the syntax. A whole number above 20 changes by
 a quarter, because `499` for `500` says nothing about a test. An index and a smaller number change
-by 1. A fraction becomes a quarter larger or a fifth smaller. `mutants` tries all mutants, or a
-sample, of the modules whose path contains a PATH, and with `--safety` of those in `SAFETY`. It
-lists each mutant that no test noticed, with the reason if `equivalent.py` says that no test can
-notice it. The exit status is 1 if the tests noticed less than 98 %.
+by 1. A fraction becomes a quarter larger or a fifth smaller.
 
-All tests that run in this process take part (`TESTS` in `trials.py`). Run it as a user or in a
-container that can destroy nothing: a fault may be in code that deletes files or ends processes. The
-faults that the random plans must find are in `tests/simulate/PLANTED.md`.
+All mutants are tried, or a sample, of the modules whose path contains a PATH of `--only`, and with
+`--safety` of those in `SAFETY`. All tests that run in this process take part (`TESTS` in
+`trials.py`), or those of `--tests`. Each mutant that no test noticed is printed, with the reason if
+`equivalent.py` says that no test can notice it. `not noticed` means that no test failed in 6 s of
+tests, the fastest first; `not reached`, that none executes it. The exit status is 1 if the tests
+noticed less than 98 %.
+
+A clone remembers which test noticed a mutant (`.pytest_cache/power/noticed.json`). That test runs
+first the next time, and the program prints LOST for a mutant that was noticed once and is not now:
+run it before and after you delete tests. It may be ended, and loses at most the mutants under way.
+
+Run it as a user or in a container that can destroy nothing: a fault may be in code that deletes
+files or ends processes. The faults that the random plans must find are in
+`tests/simulate/PLANTED.md`.
 
 The tools mutmut and cosmic-ray are not suitable. mutmut (3.8) leaves out all code outside
 functions, which is every table and constant. Most mutants of cosmic-ray (8.7) are like `a << b` for
@@ -35,32 +30,25 @@ two floats, which every test notices. Neither tool draws a sample.
 from __future__ import annotations
 
 import argparse
+import hashlib
+import json
 import os
 import shutil
-import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections import Counter
+from collections.abc import Collection, Iterable, Iterator
+from io import TextIOWrapper
 from pathlib import Path
 
 from tests.power.equivalent import EQUIVALENT
-from tests.power.scales import (
-    Results,
-    drawn,
-    is_measured,
-    load,
-    present,
-    report,
-    save,
-    was_noticed,
-)  # fmt: skip
-from tests.power.trials import NOBODY, UNDECIDED, UNREACHED, Trial, Trials, digest
+from tests.power.mutants import mutants
+from tests.power.trials import NOBODY, TESTS, UNDECIDED, UNREACHED, Trial, Trials
 
 ROOT = Path(__file__).parents[2]
-BASELINE = Path(__file__).with_name("baseline.json")
 CACHE = ROOT / ".pytest_cache" / "power"
-SCALES = ("mutants", "hunks")
+NOTICED = CACHE / "noticed.json"
 SAFETY = (
     "acsard/core/guard.py",
     "acsard/core/motion/neutral.py",
@@ -75,70 +63,66 @@ ENOUGH = 0.98
 """Share of the mutants of `SAFETY` that tests must notice."""
 
 
+def drawn(root: Path, only: Collection[str], seed: int) -> list[Trial]:
+    """Return all mutants in a random order that depends on the seed.
+
+    The order follows from each mutant's key. So an edit of the source moves only its own mutants.
+    With `only`, the modules are those whose path contains one of these.
+    """
+    met: Counter[str] = Counter()
+    lots: list[tuple[bytes, Trial]] = []
+    paths = sorted(path.relative_to(root).as_posix() for path in root.glob("acsard/**/*.py"))
+    for path in (path for path in paths if not only or any(part in path for part in only)):
+        for _, _, statement, key, text in mutants(root, path):
+            met[key] += 1
+            lot = hashlib.sha256(f"{seed} {met[key]} {key}".encode()).digest()
+            name = f"{key} #{met[key]}" if met[key] > 1 else key
+            lots.append((lot, Trial(name, path, frozenset({statement} - {0}), text)))
+    return [trial for _, trial in sorted(lots, key=lambda pair: pair[0])]
+
+
 class Run:
     """One call of this program."""
 
     def __init__(self, asked: argparse.Namespace) -> None:
         self.asked, self.began = asked, time.monotonic()
+        self.before: dict[str, str] = json.loads(NOTICED.read_text()) if NOTICED.exists() else {}
+        self.verdicts: dict[str, str] = {}
 
     def minutes(self) -> float:
         return (time.monotonic() - self.began) / 60
 
-    def in_time(self, items: Iterable[Trial]) -> Iterator[Trial]:
-        for item in items:
+    def in_time(self, trials: Iterable[Trial]) -> Iterator[Trial]:
+        for trial in trials:
             if self.minutes() > self.asked.minutes:
                 return
-            yield item
+            yield trial
 
-    def tried(
-        self, items: list[Trial], results: Results, keep: Callable[[Trial, str], None]
-    ) -> None:
-        """Try the items that have no result yet. Call `keep` after each."""
+    def mutants(self) -> int:
+        """Draw mutants, try each, and print those that no test notices."""
+        only = [*self.asked.only, *(SAFETY if self.asked.safety else ())]
+        pool = drawn(ROOT, only, self.asked.seed)[: self.asked.sample]
+        pool = [trial._replace(first=self.before.get(trial.name, "")) for trial in pool]
 
         def work(trials: Trials) -> None:
-            # The test that noticed an item before can run without a measurement of all tests.
-            for final in (False, True) if any(item.first for item in items) else (True,):
-                open_ones = (None, UNDECIDED) if final else (None,)
-                todo = [i for i in items if results[i.scale].get(i.name) in open_ones]
-                if final and todo and self.minutes() < self.asked.minutes:
-                    trials.measure(self.asked.jobs, CACHE)
-                    for test in sorted(trials.failed):
-                        print(f"left out, because it fails without any fault: {test}")
-                    print(f"all tests measured, {self.minutes():.1f} min", flush=True)
-                left = len(todo)
-                for item, verdict in trials.verdicts(self.in_time(todo), self.asked.jobs):
-                    left -= 1
-                    results[item.scale][item.name] = verdict
-                    keep(item, verdict)
-                    print(f"{self.minutes():.1f} min, {left} left", file=sys.stderr, flush=True)
+            # A test that noticed a mutant before can run without a measurement of all tests.
+            self.tried(trials, [trial for trial in pool if trial.first])
+            left = [t for t in pool if self.verdicts.get(t.name, UNDECIDED) == UNDECIDED]
+            if left and self.minutes() < self.asked.minutes:
+                trials.measure(self.asked.jobs, CACHE)
+                for test in sorted(trials.failed):
+                    print(f"left out, because it fails without any fault: {test}")
+                print(f"all tests measured, {self.minutes():.1f} min")
+                self.tried(trials, left)
 
-        left = [i for i in items if results[i.scale].get(i.name) in (None, UNDECIDED)]
-        if not left or self.minutes() > self.asked.minutes:
-            return
         # The copy may not change while its tests run.
         with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder:
             ignored = shutil.ignore_patterns(".*", "__pycache__")
             shutil.copytree(ROOT, folder, ignore=ignored, dirs_exist_ok=True)
-            Trials(Path(folder), work).run()
-
-    def mutants(self) -> int:
-        """Draw mutants of some modules, try each, and print those that no test notices."""
-        only = [*self.asked.only, *(SAFETY if self.asked.safety else ())]
-        pool = drawn(ROOT, only, self.asked.seed)[: self.asked.sample]
-        results: Results = {"mutants": {}}
-
-        def keep(item: Trial, verdict: str) -> None:
-            why = EQUIVALENT.get(item.name, "")
-            if why and was_noticed(verdict):
-                print(f"not equivalent, {verdict} notices it: {item.name}", flush=True)
-            elif verdict in (NOBODY, UNREACHED):
-                line = min(item.lines, default="outside of functions")
-                print(f"{item.name}, line {line}\n    {why or verdict.upper()}", flush=True)
-
-        self.tried(pool, results, keep)
-        verdicts = results["mutants"]
-        holes = [n for n, v in verdicts.items() if v in (NOBODY, UNREACHED) and n not in EQUIVALENT]
-        noticed = sum(map(was_noticed, verdicts.values()))
+            Trials(Path(folder), self.asked.tests, work).run()
+        seen = self.verdicts
+        holes = [n for n, v in seen.items() if v in (NOBODY, UNREACHED) and n not in EQUIVALENT]
+        noticed = sum(verdict not in (NOBODY, UNREACHED, UNDECIDED) for verdict in seen.values())
         score = noticed / max(1, noticed + len(holes))
         print(
             f"{noticed} of {len(pool)} noticed, {len(holes)} not: "
@@ -146,55 +130,43 @@ class Run:
         )
         return int(score < ENOUGH)
 
-    def baseline(self) -> int:
-        """Measure the items of the baseline that have no result yet."""
-        commit = subprocess.run(
-            ["git", "-C", ROOT, "rev-parse", "HEAD"], capture_output=True, text=True
-        ).stdout.strip()
-        before, results = ("", {}) if self.asked.anew else load(BASELINE)
-        if before not in ("", commit):
-            sys.exit(f"{BASELINE.name} is of {before}: check that out, or give --anew")
-        items = present(ROOT, self.asked.scales, results, self.asked.only)
-        for item in items:
-            results.setdefault(item.scale, {}).setdefault(item.name, None)
-        save(BASELINE, commit, results)
-        self.tried(items, results, lambda item, verdict: save(BASELINE, commit, results))
-        for scale, verdicts in sorted(results.items()):
-            measured = [verdict for verdict in verdicts.values() if is_measured(verdict)]
-            noticed = sum(map(was_noticed, measured))
-            print(f"{scale}: {len(verdicts)}, measured {len(measured)}, noticed {noticed}")
-        return 0
-
-    def compare(self) -> int:
-        """Print what the tests noticed once and do not notice any more."""
-        commit, known = load(BASELINE)
-        known = {scale: known[scale] for scale in self.asked.scales if scale in known}
-        items = present(ROOT, known, known, self.asked.only)
-        file = CACHE / f"compared-{digest(ROOT)}.json"
-        _, now = load(file)
-        now = {scale: dict(now.get(scale, {})) for scale in known}
-        before = [(item, known[item.scale].get(item.name)) for item in items]
-        todo = [item._replace(first=test) for item, test in before if test and was_noticed(test)]
-        self.tried(todo, now, lambda item, verdict: save(file, commit, now))
-        print(f"compared with {commit}")
-        return int(report(known, now, items))
+    def tried(self, trials: Trials, some: list[Trial]) -> None:
+        """Try these mutants, and print and store what comes out."""
+        for trial, verdict in trials.verdicts(self.in_time(some), self.asked.jobs):
+            name = trial.name
+            self.verdicts[name] = verdict
+            why = EQUIVALENT.get(name, "")
+            if verdict in (NOBODY, UNREACHED):
+                line = min(trial.lines, default="outside of functions")
+                print(f"{name}, line {line}\n    {why or verdict.upper()}")
+                if trial.first:
+                    print(f"    LOST: {trial.first} noticed it")
+            elif verdict != UNDECIDED:
+                if why:
+                    print(f"not equivalent, {verdict} notices it: {name}")
+                self.before[name] = verdict
+                CACHE.mkdir(parents=True, exist_ok=True)
+                part = NOTICED.with_suffix(f".{os.getpid()}")
+                part.write_text(json.dumps(self.before, indent=0))
+                part.replace(NOTICED)
+            print(f"{self.minutes():.1f} min, {len(self.verdicts)} tried", file=sys.stderr)
 
 
 def main() -> int:
     parser = argparse.ArgumentParser(prog="python -m tests.power", description=__doc__)
-    parser.add_argument("command", choices=("compare", "baseline", "mutants"))
-    parser.add_argument("--jobs", type=int, default=2, help="how many processes")
-    parser.add_argument("--minutes", type=float, default=1e9, help="start nothing after this time")
-    parser.add_argument("--scales", nargs="+", default=SCALES, choices=SCALES)
-    parser.add_argument("--anew", action="store_true", help="a new baseline of this tree")
-    parser.add_argument("--only", nargs="+", default=[], metavar="PATH", help="parts of paths")
+    parser.add_argument("command", choices=["mutants"])
     parser.add_argument("--safety", action="store_true", help="the modules that stop the robot")
+    parser.add_argument("--only", nargs="+", default=[], metavar="PATH", help="parts of paths")
+    parser.add_argument("--tests", nargs="+", default=TESTS, metavar="PATH", help="patterns")
     parser.add_argument("--sample", type=int, help="how many mutants")
     parser.add_argument("--seed", type=int, default=1, help="which mutants")
+    parser.add_argument("--minutes", type=float, default=1e9, help="start nothing after this time")
+    parser.add_argument("--jobs", type=int, default=2, help="how many processes")
     asked = parser.parse_args()
-    os.nice(19)
-    command: Callable[[Run], int] = getattr(Run, asked.command)
-    return command(Run(asked))
+    for stream in (sys.stdout, sys.stderr):  # into a file too
+        if isinstance(stream, TextIOWrapper):
+            stream.reconfigure(line_buffering=True)
+    return Run(asked).mutants()
 
 
 if __name__ == "__main__":

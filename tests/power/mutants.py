@@ -52,7 +52,7 @@ class Mutant(NamedTuple):
         path: The module, relative to the project.
         line: The line of the fault.
         statement: The first line of the statement with the fault, or 0 outside of functions.
-        key: The description that `equivalent.py` and `baseline.json` use. It has no line number.
+        key: The description that `equivalent.py` uses. It has no line number.
         text: Returns the source of the module with the fault in it.
     """
 

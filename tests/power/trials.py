@@ -65,7 +65,6 @@ class Trial(NamedTuple):
     """A change of the product that tests should notice.
 
     Attributes:
-        scale: The kind of change.
         name: The name under which the result is stored.
         path: The changed module, relative to the project.
         lines: The changed lines of the unchanged module, if they are in functions.
@@ -73,7 +72,6 @@ class Trial(NamedTuple):
         first: The test that noticed the change before.
     """
 
-    scale: str
     name: str
     path: str
     lines: frozenset[int]
@@ -86,11 +84,12 @@ def short(test: str) -> str:
     return test.partition("[")[0]
 
 
-def digest(root: Path) -> str:
-    """Return a digest of the product and of its tests."""
+def digest(root: Path, tests: Iterable[str]) -> str:
+    """Return a digest of the product, the files of its tests, and the collected tests."""
     files = (path for part in ("acsard", "tests") for path in (root / part).rglob("*.py"))
     kept = sorted(path for path in files if root / "tests" / "power" not in path.parents)
-    return hashlib.sha256(b"".join(path.read_bytes() for path in kept)).hexdigest()[:12]
+    texts = [path.read_bytes() for path in kept]
+    return hashlib.sha256(b"".join([*texts, repr([*tests]).encode()])).hexdigest()[:12]
 
 
 def enter(root: Path) -> None:
@@ -193,13 +192,13 @@ def codes(code: CodeType) -> Iterator[CodeType]:
 class Trials:
     """A pytest plugin that makes trials instead of running each collected test once."""
 
-    def __init__(self, root: Path, work: Callable[[Trials], None]) -> None:
+    def __init__(self, root: Path, tests: Sequence[str], work: Callable[[Trials], None]) -> None:
         """Store `work`, which `run` calls when the tests are collected."""
         self.failed: set[str] = set()
         self.items: dict[str, pytest.Item] = {}
         self.fails: Callable[[str], None] = self.failed.add
         self.until = math.inf
-        self._root, self._work = root, work
+        self._root, self._tests, self._work = root, tests, work
         self._seconds: dict[str, float] = {}
         self._reached: dict[tuple[str, int], int] = {}
         """The tests that execute a block, as a mask of bits."""
@@ -216,7 +215,7 @@ class Trials:
 
     def run(self) -> None:
         """Collect the tests, and call `work`."""
-        tests = [path for name in TESTS for path in sorted(self._root.glob(name))]
+        tests = [path for name in self._tests for path in sorted(self._root.glob(name))]
         if pytest.main([*PYTEST, *map(str, tests)], [self]) != 0:
             raise RuntimeError("the tests cannot be collected")
 
@@ -256,7 +255,8 @@ class Trials:
         """
         tests, running = list(self.items), dict[int, tuple[int, Path]]()
         size = -(-len(tests) // PARTS)
-        files = [cache / f"reach-{digest(self._root)}-{part}" for part in range(PARTS)]
+        made = digest(self._root, tests)
+        files = [cache / f"reach-{made}-{part}" for part in range(PARTS)]
         left = [(part, file) for part, file in enumerate(files) if not file.exists()]
         cache.mkdir(parents=True, exist_ok=True)
         while left or running:
