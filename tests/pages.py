@@ -17,6 +17,10 @@ ROOT = Path(__file__).resolve().parents[1]
 PAGES = ["README.md", "acsard/README.md", "tests/README.md", "deploy/README.md"]
 PAGES += [str(path.relative_to(ROOT)) for path in sorted(ROOT.glob("deploy/*/README.md"))]
 
+MANUAL = [str(path.relative_to(ROOT)) for path in sorted(ROOT.glob("deploy/manual/pages/**/*.md"))]
+
+PAGES += MANUAL
+
 _NOT_RUN = r"<!-- not run: (.*?) -->\n"
 _WHOLE_PAGE = re.compile(rf"\A# .*\n+{_NOT_RUN}")
 _FENCED = re.compile(rf"^(?:{_NOT_RUN})?```([a-z0-9]*)\n(.*?)^```$", re.M | re.S)

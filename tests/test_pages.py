@@ -24,6 +24,7 @@ from acsard import cli
 from acsard.core.config.settings import Config
 from tests.each import each
 from tests.pages import PAGES, ROOT, Block, blocks, prose, text_of
+from tests.tools.reference import GENERATED
 
 COMMANDS = list(dict.fromkeys(line for block in blocks() for line in block.commands()))
 
@@ -139,6 +140,9 @@ def test_the_subscribers_of_other_languages_in_the_readme_are_those_that_are_run
 
 # links and files
 
+# The manual links to files of the repository by their address, because it is read without them.
+FORGE = "https://github.com/acsard/acsard/blob/HEAD/"
+
 
 def anchors(text: str) -> set[str]:
     """Return the link targets of headings as a code forge makes them: lower case, - for spaces."""
@@ -149,10 +153,11 @@ def anchors(text: str) -> set[str]:
 @each("page", [*PAGES, "CHANGELOG.md", "SECURITY.md"])
 def test_every_link_leads_somewhere(page: str) -> None:
     for target in re.findall(r"\]\(([^)\s]+)\)", prose(page)):
-        if "://" in target:
+        if "://" in target and not target.startswith(FORGE):
             continue
-        name, _, anchor = target.partition("#")
-        path = (ROOT / page).parent / name if name else ROOT / page
+        name, _, anchor = target.removeprefix(FORGE).partition("#")
+        place = ROOT if target.startswith(FORGE) else (ROOT / page).parent
+        path = place / name if name else ROOT / page
         assert path.exists(), target
         if anchor:
             assert anchor in anchors(path.read_text(encoding="utf-8")), target
@@ -181,6 +186,10 @@ def recipe(begin: str, end: str) -> set[str]:
     return files_in("\n".join(re.findall(r"`([^`\s]+)`", part)))
 
 
+# The built manual, and what its build keeps.
+BUILT = ("acsard/manual/", "deploy/manual/site/", "deploy/manual/.cache/")
+
+
 def files_with(pattern: str, *rooms: str) -> set[str]:
     """Return the files below these directories whose text matches the pattern.
 
@@ -189,8 +198,11 @@ def files_with(pattern: str, *rooms: str) -> set[str]:
     files = [file for room in rooms for file in (ROOT / room).rglob("*") if file.is_file()]
     texts = [(file, file.read_bytes()) for file in files if file.suffix != ".pyc"]
     matches = [file for file, text in texts if re.search(pattern.encode(), text)]
-    names = {str(file.relative_to(ROOT)).removeprefix("acsard/") for file in matches}
-    return names - {"README.md"}  # the recipes themselves
+    names = {str(file.relative_to(ROOT)) for file in matches} - set(GENERATED)
+    built = {name for name in names if name.startswith(BUILT)}
+    return {name.removeprefix("acsard/") for name in names - built} - {
+        "README.md"  # the recipes themselves
+    }
 
 
 def test_the_recipe_for_a_verb_names_every_file_that_lists_the_verbs() -> None:

@@ -173,6 +173,7 @@ def test_the_wheel_lists_its_libraries_and_the_code_of_others_in_it(built: list[
     for pin in contents.pins():
         assert f'"pkg:pypi/{pin.name}@{pin.version}"' in text
     assert '"pkg:npm/plotly.js-basic-dist-min@' in text
+    assert '"pkg:pypi/zensical@' in text
 
 
 @builds

@@ -16,6 +16,8 @@ ROOT = Path(__file__).resolve().parents[2]
 
 LOCK = ROOT / "deploy" / "systemd" / "requirements.lock"
 
+RELEASE_LOCK = ROOT / "deploy" / "release" / "requirements.lock"
+
 SBOM = "acsard.cdx.json"  # its name in the wheel
 
 PLOTLY = ROOT / "acsard" / "recording" / "plotly-basic.min.js"
@@ -44,6 +46,9 @@ def sbom(version: str) -> str:
     """Return a CycloneDX document: acsard, the code of others in it, and the locked libraries."""
     plotly = re.search(r"plotly\.js .* v([0-9.]+)", PLOTLY.read_text(encoding="utf-8")[:200])
     assert plotly is not None
+    zensical = re.search(r"^zensical==(\S+)", RELEASE_LOCK.read_text(), re.M)
+    assert zensical is not None
+    manual = f"pkg:pypi/zensical@{zensical[1]}"
     us = f"pkg:pypi/acsard@{version.replace('+', '%2B')}"
     bundled = f"pkg:npm/plotly.js-basic-dist-min@{plotly[1]}"
     libraries: list[dict[str, Any]] = [
@@ -79,7 +84,16 @@ def sbom(version: str) -> str:
                         "version": plotly[1],
                         "licenses": [{"license": {"id": "MIT"}}],
                         "purl": bundled,
-                    }
+                    },
+                    # The scripts and styles of the manual, which a wheel of a release contains.
+                    {
+                        "type": "library",
+                        "bom-ref": manual,
+                        "name": "zensical",
+                        "version": zensical[1],
+                        "licenses": [{"license": {"id": "MIT"}}],
+                        "purl": manual,
+                    },
                 ],
             },
         },

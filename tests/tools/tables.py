@@ -1,4 +1,4 @@
-"""Writes parts of the pages, of the router's and of the bridge's file from the table of keys.
+"""Writes the generated pages, and parts of others, of the router's and of the bridge's file.
 
 `python -m tests.tools.tables` writes them, and `tests/test_tables.py` compares them.
 """
@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from pathlib import Path
 from typing import get_args
 
@@ -31,6 +31,7 @@ from acsard.core.messages.permissions import (
 from acsard.core.ros.transports import ros_names
 from acsard.core.values import ROLES, Role, Verb
 from acsard.machine.router_file import EXAMPLE_ROBOT
+from tests.tools.reference import GENERATED, table
 
 ROOT = Path(__file__).parents[2]
 
@@ -38,8 +39,8 @@ ROOT = Path(__file__).parents[2]
 # the tables of the pages
 
 
-def key_table() -> str:
-    return _table(
+def keytable() -> str:
+    return table(
         ("key", "direction", "least role", "type", "rate", "meaning"),
         ((f"`{t.key}`", t.direction, _least(t), t.type, t.rate, t.note) for t in TOPICS),
     )
@@ -53,7 +54,7 @@ def _least(topic: Topic) -> str:
     return topic.publish or topic.query or topic.subscribe or ""
 
 
-def role_table() -> str:
+def roletable() -> str:
     """Return the permissions of each role."""
     rows = []
     for role in ROLES:
@@ -72,13 +73,7 @@ def role_table() -> str:
             put = [f"`{key}`" for key in keys_for(role, "publish", TOPICS)]
             may += [f"publish {', '.join(put)}"] if put else []
         rows.append((role, "; ".join(may)))
-    return _table(("role", "permissions"), rows)
-
-
-def _table(head: tuple[str, ...], rows: Iterable[tuple[str, ...]]) -> str:
-    lines = [[cell.replace("|", "\\|") for cell in row] for row in (head, *rows)]
-    top, *below = (f"| {' | '.join(cells)} |\n" for cells in lines)
-    return "".join((top, "|---" * len(head) + "|\n", *below))
+    return table(("role", "permissions"), rows)
 
 
 # the router's file
@@ -168,7 +163,7 @@ def service_page(text: str) -> str:
     """Return the page about the service with the table of roles and the events of the verbs."""
     verbs = " ".join(f"`{verb}`" for verb in get_args(Verb))
     text = _replaced(r"(^\| A service call was executed.*? \| )(?:`\w+` ?)+(?= \|)", verbs, text)
-    return _marked("roles", role_table())(text)
+    return _marked("roles", roletable())(text)
 
 
 # all files
@@ -179,6 +174,10 @@ def _marked(mark: str, table: str) -> Callable[[str], str]:
     return lambda text: _replaced(rf"(^<!-- {mark}: .* -->\n)(?:\|.*\n)*", table, text)
 
 
+def _whole(write: Callable[[], str]) -> Callable[[str], str]:
+    return lambda _: write()
+
+
 def _replaced(pattern: str, part: str, text: str) -> str:
     """Replace the only match of the pattern by its first group followed by `part`."""
     changed, count = re.subn(pattern, lambda match: match[1] + part, text, flags=re.M)
@@ -187,11 +186,12 @@ def _replaced(pattern: str, part: str, text: str) -> str:
 
 
 FILES: dict[str, Callable[[str], str]] = {
-    "README.md": _marked("keys", key_table()),
+    "deploy/manual/pages/reference/keys.md": _marked("keys", keytable()),
     "deploy/ros2/README.md": ros_page,
     "deploy/ros2/zenoh-bridge-ros2dds.json5": bridge_file,
     "deploy/systemd/README.md": service_page,
     "deploy/zenoh/router.json5": router_file,
+    **{name: _whole(write) for name, write in GENERATED.items()},
 }
 """Maps each file to the function that writes its generated parts again."""
 
@@ -199,4 +199,4 @@ FILES: dict[str, Callable[[str], str]] = {
 if __name__ == "__main__":
     for name, write in FILES.items():
         file = ROOT / name
-        file.write_text(write(file.read_text()))
+        file.write_text(write(file.read_text() if file.exists() else ""))

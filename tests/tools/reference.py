@@ -1,0 +1,289 @@
+"""Writes the generated pages of the manual's reference from the product.
+
+`python -m tests.tools.tables` writes them, and `tests/test_tables.py` compares them.
+"""
+
+from __future__ import annotations
+
+import argparse
+import re
+from collections.abc import Callable, Iterable, Iterator
+from pathlib import Path
+from typing import Any
+
+from msgspec.structs import replace
+from prometheus_client.parser import text_string_to_metric_families
+
+from acsard.cli.command_line import parser
+from acsard.core.codes import CODES
+from acsard.core.messages.json_schema import SCHEMAS
+from acsard.core.messages.schema import BatterySummary
+from acsard.core.ros.transports import ros_names
+from acsard.web.app import ROUTES
+from acsard.web.metrics import text as metrics_text
+from tests.system.contract import matrix
+from tests.unit.test_page_metrics import STATE
+
+ROOT = Path(__file__).parents[2]
+
+PAGES = "deploy/manual/pages/reference"
+
+NOTE = "<!-- written by python -m tests.tools.tables -->"
+
+
+def table(head: tuple[str, ...], rows: Iterable[tuple[str, ...]]) -> str:
+    lines = [[cell.replace("|", "\\|") for cell in row] for row in (head, *rows)]
+    top, *below = (f"| {' | '.join(cells)} |\n" for cells in lines)
+    return "".join((top, "|---" * len(head) + "|\n", *below))
+
+
+def _page(title: str, introduction: str, *parts: str) -> str:
+    return "\n".join((f"# {title}\n\n{NOTE}\n", f"{introduction}\n", *parts))
+
+
+# settings
+
+
+def settings() -> str:
+    """Return a table for each section of `acsard.toml`."""
+    parts: list[str] = []
+    for section, note, rows in _sections((ROOT / "acsard.toml").read_text(encoding="utf-8")):
+        if not rows:
+            continue
+        cells = (
+            (f"`{key}`", f"`{value}`", meaning or "see the key above")
+            for key, value, meaning in rows
+        )
+        text = f"{note}\n\n" if note else ""
+        parts.append(f"## {section}\n\n{text}{table(('key', 'default', 'meaning'), cells)}")
+    return _page(
+        "Settings",
+        "`acsard.toml` of the robot has these keys. A key that the file lacks has its default. "
+        "`acsard check` prints the value\nof every key, or every mistake with its remedy. "
+        "[Set a value](../howto/settings.md) says how to change one.",
+        *parts,
+    )
+
+
+def _sections(text: str) -> Iterator[tuple[str, str, list[tuple[str, str, str]]]]:
+    """Yield each section of the file: its name, its comment, and its keys with their comments."""
+    section, note, rows = "", "", list[tuple[str, str, str]]()
+    comment: list[str] = []
+    for line in text.splitlines():
+        if line.startswith("#"):
+            comment.append(line.removeprefix("#").strip())
+        elif line.startswith("["):
+            if section and line.strip("[]") != section:
+                yield section, note, rows
+            if line.strip("[]") != section:
+                section, note, rows = line.strip("[]"), " ".join(comment), []
+            comment = []
+        elif match := re.match(r"(\w+) = (.*?)(?:\s+#\s*(.*))?$", line):
+            meaning = " ".join([*comment, *filter(None, match.groups()[2:])])
+            rows.append((match[1], match[2], _literal(meaning)))
+            comment = []
+        elif section == "":
+            comment = []
+    yield section, note, rows
+
+
+# types of messages
+
+
+def messages() -> str:
+    """Return the fields of each message type."""
+    parts: list[str] = []
+    for name, schema in SCHEMAS.items():
+        if name == "Config":
+            continue
+        described = {name: schema} | {
+            key: value for key, value in schema["$defs"].items() if "properties" in value
+        }
+        for kind, fields in described.items():
+            if kind != name and (kind in SCHEMAS or f"## {kind}\n" in "".join(parts)):
+                continue
+            rows = (
+                (f"`{field}`", _kind(value), _flat(value.get("description", "")))
+                for field, value in fields.get("properties", {}).items()
+            )
+            about = _flat(fields.get("description", ""))
+            body = table(("field", "type", "meaning"), rows) if fields.get("properties") else ""
+            parts.append("\n\n".join(filter(None, (f"## {kind}", about, body))).rstrip() + "\n")
+    return _page(
+        "Message types",
+        "A query of `schema/<Type>` returns the same as a JSON Schema. The units are SI unless a "
+        "field says otherwise. A type whose\nname ends with `In` is for messages to the daemon.",
+        *parts,
+    )
+
+
+def _flat(text: str) -> str:
+    return " ".join(text.split()).replace("<", "&lt;")
+
+
+def _kind(schema: dict[str, Any]) -> str:
+    if "$ref" in schema:
+        return str(schema["$ref"]).rpartition("/")[2]
+    if "anyOf" in schema:
+        return " or ".join(map(_kind, schema["anyOf"]))
+    if "enum" in schema:
+        values = [f"`{value}`" for value in schema["enum"] if value != ""]
+        return ", ".join(values) if len(values) <= 12 else str(schema.get("type", "string"))
+    if schema.get("type") == "array":
+        return f"list of {_kind(schema['items'])}" if schema.get("items") else "list"
+    if schema.get("type") == "object" and isinstance(schema.get("additionalProperties"), dict):
+        return f"map to {_kind(schema['additionalProperties'])}"
+    return str(schema.get("type", "any"))
+
+
+# command line
+
+
+def commands() -> str:
+    """Return the help of each subcommand."""
+    return _page(
+        "Command line",
+        "`acsard VERB --help` prints the same text.",
+        *_helps(parser(), ""),
+    )
+
+
+def _helps(command: argparse.ArgumentParser, path: str) -> Iterator[str]:
+    yield f"## acsard{path}\n\n{_literal(command.description or '')}\n"
+    subparsers = [a for a in command._actions if isinstance(a, argparse._SubParsersAction)]
+    rows = []
+    for action in command._actions:
+        if (
+            action in subparsers
+            or action.help in (None, argparse.SUPPRESS)
+            or action.dest == "help"
+        ):
+            continue
+        named = " ".join(action.option_strings) or str(action.metavar or action.dest)
+        value = "" if not action.option_strings or action.nargs == 0 else f" {_value(action)}"
+        rows.append((f"`{named}{value}`", _literal((action.help or "").replace("%%", "%"))))
+    if rows:
+        yield table(("argument", "meaning"), rows)
+    for subparser in subparsers:
+        for name, child in subparser.choices.items():
+            yield from _helps(child, f"{path} {name}")
+
+
+def _value(action: argparse.Action) -> str:
+    return str(action.metavar or action.dest.upper())
+
+
+def _literal(text: str) -> str:
+    """Return plain text as Markdown, in which < and * outside of code stay as they are."""
+    parts = re.split(r"(`[^`]*`)", " ".join(text.split()))
+    return "".join(
+        part if part.startswith("`") else re.sub(r"([<*_])", r"\\\1", part) for part in parts
+    )
+
+
+# codes
+
+
+def codes() -> str:
+    """Return the text and the advice of each code."""
+    rows = (
+        (f"`{code}`", _said(entry.text), _said(entry.advice))
+        for code, entry in CODES.items()
+        if entry.text
+    )
+    return _page(
+        "Codes and advice",
+        "`code` in `state`, `sources`, `causes` and the events says in one word why the robot does "
+        "not move, and what went wrong.\nWords in capitals stand for values. `acsard doctor` and "
+        "`acsard echo state -n 1 --short` print the text of your robot.",
+        table(("code", "text", "what to do"), rows),
+    )
+
+
+def _said(text: str) -> str:
+    return _flat(re.sub(r"{(\w+)[^}]*}", lambda match: match[1].upper(), text))
+
+
+# the page
+
+
+def http() -> str:
+    """Return the paths of the page for programs."""
+    rows = (
+        (f"`{row.method}`", f"`{row.path}`", row.least or "none needed", row.summary)
+        for row in ROUTES
+        if row.summary
+    )
+    return _page(
+        "HTTP API",
+        "The robot's page serves these paths to programs; `GET /api/openapi.json` describes them "
+        "with their types. A program on\nthe robot needs no token.",
+        table(("method", "path", "least role", "purpose"), rows),
+    )
+
+
+def metrics() -> str:
+    """Return the metrics of a robot that reports everything."""
+    battery = BatterySummary(volts=12.0, amps=1.0, percent=50.0, level="ok")
+    state = replace(
+        STATE, emergency_stop="released", bumpers=[False], battery=battery, certificate_days=1.0
+    )
+    text = metrics_text("acsar", "0", state, True, 1, {"x": 1}, {"x": 1}).decode()
+    rows = []
+    for family in text_string_to_metric_families(text):
+        labels = sorted({k for s in family.samples for k in s.labels} - {"robot"})
+        name = family.name + ("_total" if family.type == "counter" else "")
+        rows.append(
+            (f"`{name}`", ", ".join(f"`{label}`" for label in labels), family.documentation)
+        )
+    return _page(
+        "Metrics",
+        "`GET /metrics` of the robot's page returns these metrics. Each has the label `robot`. A "
+        "metric of a\nvalue that the robot does not report is missing.",
+        table(("metric", "further labels", "meaning"), rows),
+    )
+
+
+# ROS and promises
+
+
+def ros() -> str:
+    """Return the ROS names."""
+    found: dict[str, tuple[str, str, list[str]]] = {}
+    for row in ros_names():
+        found.setdefault(row.name, (row.direction, row.native, []))[2].append(row.type)
+    rows = (
+        (f"`{name}`", direction, " or ".join(types), f"`{native}`")
+        for name, (direction, native, types) in found.items()
+    )
+    return _page(
+        "ROS names",
+        "The robot has these names in ROS 2, below `[ros] namespace`. `acsard topics --ros` prints "
+        "those of your configuration.",
+        table(("name", "direction", "type", "key of the bus"), rows),
+    )
+
+
+def promises() -> str:
+    """Return the contract that every program may rely on."""
+    body = matrix().partition("writes this page.\n\n")[2]
+    return _page(
+        "Promises",
+        "Every program may rely on these. A door is a way into the robot, and a test tries each "
+        "promise through each door: `yes`\nholds, `-` is not offered through this door. The last "
+        "column names the marks of the test.",
+        body,
+    )
+
+
+GENERATED: dict[str, Callable[[], str]] = {
+    f"{PAGES}/settings.md": settings,
+    f"{PAGES}/messages.md": messages,
+    f"{PAGES}/commands.md": commands,
+    f"{PAGES}/codes.md": codes,
+    f"{PAGES}/http.md": http,
+    f"{PAGES}/metrics.md": metrics,
+    f"{PAGES}/ros.md": ros,
+    f"{PAGES}/promises.md": promises,
+}
+"""Maps each generated page to the function that writes it."""
