@@ -29,7 +29,7 @@ from acsard.core.ros.transports import ros_names
 from acsard.core.values import NS_PER_S, GyroStatus, Recording
 from tests import promised
 from tests.each import each
-from tests.unit.core.messages.examples import OUTPUTS, SNAPSHOT
+from tests.unit.examples import OUTPUTS, SNAPSHOT
 
 FILES = Path(__file__).parents[1] / "deploy" / "ros2"
 CONFIG = Config()

@@ -35,7 +35,7 @@ from tests.system.versions import (
     grow,
     plain_environment,
 )
-from tests.unit.core.messages.test_schema import ROS_FIELDS
+from tests.unit.test_messages_schema import ROS_FIELDS
 
 pytestmark = pytest.mark.slow
 

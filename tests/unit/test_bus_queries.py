@@ -48,7 +48,7 @@ from acsard.core.ros.shapes import Trigger
 from acsard.core.ros.transports import PARAMETER_SERVICES
 from acsard.core.values import ROLES, Answer, Plain, Pose, Request, Status
 from tests.each import each
-from tests.unit.core.messages.examples import OUTPUTS, SNAPSHOT, START, STATUS, due
+from tests.unit.examples import OUTPUTS, SNAPSHOT, START, STATUS, due
 
 NATIVE = ("odom", "tf", "tf_static", "wheel_states", "cmd_vel_out", "diagnostics")
 """Published keys whose types are ROS messages and therefore have a CDR form."""

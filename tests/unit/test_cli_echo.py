@@ -22,7 +22,7 @@ from acsard.core.messages.schema import (
 )
 from acsard.host.errors import Exit
 from tests.each import each
-from tests.unit.core.messages.examples import OUTPUTS
+from tests.unit.examples import OUTPUTS
 
 BODY = {"linear": {"x": 0.5}, "name": ["ä", "b\n"], "n": -3, "ok": True, "none": None}
 

@@ -36,7 +36,7 @@ from acsard.web.socket_sender import Following
 from acsard.web.streams import VIEWER_KEYS as FOLLOWED
 from acsard.web.streams import Stream
 from tests.each import each
-from tests.unit.core.messages.examples import OUTPUTS, SNAPSHOT, START, due
+from tests.unit.examples import OUTPUTS, SNAPSHOT, START, due
 from tests.unit.page_schemas import FRAMES, SCHEMAS, is_described_frame, kinds, spoilt
 
 COMMAND = {"cmd": {"linear_x": 0.2, "angular_z": -0.1}, "stamp": 1763700000123.4}
