@@ -113,8 +113,11 @@ def test_every_key_of_the_table_has_its_row_and_an_unknown_key_has_no_row() -> N
 
 
 def test_a_role_has_its_own_permissions_and_those_of_lower_roles() -> None:
-    lower = {role: [least for least in ROLES if has(role, least)] for role in ("", *ROLES)}
-    assert lower == {"": [], **{role: [*ROLES[: ROLES.index(role) + 1]] for role in ROLES}}
+    lower: dict[str, list[Role]] = {
+        role: [least for least in ROLES if has(role, least)] for role in ("", *ROLES)
+    }
+    assert lower.pop("") == []
+    assert lower == {role: [*ROLES[: ROLES.index(role) + 1]] for role in ROLES}
 
 
 def test_each_row_has_a_role_for_exactly_the_uses_of_its_direction() -> None:

@@ -287,7 +287,6 @@ def test_the_schema_of_the_state_accepts_each_mode_and_no_other() -> None:
     report = Report(Config(), START)
     for mode in Mode:
         due(report, replace(OUTPUTS, mode=mode), {"state"}, lambda: SNAPSHOT)
-        message = report.current("state", lambda: SNAPSHOT)
-        assert message is not None
+        message: Any = report.current("state", lambda: SNAPSHOT)
         assert refused("RobotState", as_json(message)) == []
     assert refused("RobotState", as_json(message) | {"mode": "idle"})
