@@ -34,7 +34,7 @@ FAIL baud rate: received_foreign | other bytes in the lines
     and computer, and a short cable away from the motors' leads
 FAIL baud rate: received_garbage | only garbage
     at {configured} baud {heard}; no good line at any other rate
-    -> does the firmware send at 9600 to 115200 baud, at TTL level and not RS-232? is this the right
+    -> does the firmware send at 9600 to 500000 baud, at TTL level and not RS-232? is this the right
     port (`acsard ports`), and is the board's ground connected to the computer's?
 FAIL baud rate: received_few | few good lines
     at {configured} baud {heard}; fewer good lines at any other rate

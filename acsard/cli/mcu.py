@@ -54,7 +54,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     add_config(check)
     add_port(check)
     check.add_argument(
-        "--baud-rate", type=int, metavar="N", help="baud rate to try first, from 9600 to 115200"
+        "--baud-rate", type=int, metavar="N", help="baud rate to try first, from 9600 to 500000"
     )
     check.add_argument(
         "--yes",

@@ -40,7 +40,7 @@ _PAGE = "  page    {where}, for a browser; a line below says when the page is re
 def add_options(parser: argparse.ArgumentParser) -> None:
     add_config(parser)
     add_port(parser)
-    parser.add_argument("--baud-rate", type=int, metavar="N", help="from 9600 to 115200")
+    parser.add_argument("--baud-rate", type=int, metavar="N", help="from 9600 to 500000")
     parser.add_argument("--id", metavar="ID", help="the robot's id on the bus")
     parser.add_argument(
         "--namespace", metavar="NAME", help="prefix of the robot's ROS topics (ros.namespace)"

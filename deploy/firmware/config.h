@@ -11,7 +11,7 @@
 /* The line */
 
 #ifndef BAUD_RATE
-#define BAUD_RATE 115200UL     /* as baud_rate in acsard.toml: 9600 to 115200 */
+#define BAUD_RATE 115200UL     /* as baud_rate in acsard.toml: 9600 to 500000 */
 #endif
 #define COMMAND_WATCHDOG_MS 300 /* without a valid line for this long the motors stop; at most 500 */
 #ifndef REQUIRE_CHECK

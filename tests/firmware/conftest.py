@@ -16,6 +16,7 @@ from tests.firmware.board import (
     build_firmware,
     build_library,
     build_runner,
+    build_sketch,
     missing,
 )
 from tests.system.harness import until
@@ -77,6 +78,18 @@ def firmware(tmp_path_factory: pytest.TempPathFactory) -> Path:
     if lacking:
         pytest.skip(lacking)
     return build_firmware(tmp_path_factory.mktemp("firmware"))
+
+
+@pytest.fixture(scope="session")
+def sketch(firmware: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The ELF file of the Arduino sketch."""
+    return build_sketch(tmp_path_factory.mktemp("sketch"))
+
+
+@pytest.fixture(scope="session")
+def wired_sketch(firmware: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The ELF file of the sketch with an emergency stop."""
+    return build_sketch(tmp_path_factory.mktemp("wired"), ("ESTOP = -1", f"ESTOP = {ESTOP}"))
 
 
 @pytest.fixture(scope="session")

@@ -331,7 +331,7 @@ static avr_cycle_count_t on_top(avr_t *unused, avr_cycle_count_t when, void *whi
 
 /* The simulator has no double buffer: in PWM mode a compare register is in force from the next time
  * that the counter, up and down, is at its top; else at once. Looked at whenever one is written. */
-static void take_over(int index, bool counts, unsigned top)
+static void take_over(int index, bool counts, unsigned top, unsigned cycles)
 {
     struct motor *motor = &motors[index];
     avr_cycle_count_t since;
@@ -343,28 +343,29 @@ static void take_over(int index, bool counts, unsigned top)
         motor->timer.written = motor->timer.compare = word(PWM[index].compare);
         return;
     }
-    since = avr->cycle - motor->timer.started;
+    since = (avr->cycle - motor->timer.started) / cycles;
     if ((since + top) / (2 * top) > motor->timer.tops) {
         motor->timer.tops = (since + top) / (2 * top);
         motor->timer.compare = motor->timer.written;
     }
     motor->timer.written = word(PWM[index].compare);
     if (motor->timer.written != motor->timer.compare)
-        avr_cycle_timer_register(avr, (2 * motor->timer.tops + 1) * top - since, on_top,
+        avr_cycle_timer_register(avr, ((2 * motor->timer.tops + 1) * top - since) * cycles, on_top,
                                  (void *)(intptr_t)index);
 }
 
-/* What the PWM pin of a motor gives, 0 to 1: phase correct at the full clock with its top in ICR is
- * all we know, or the port when the timer does not have the pin. */
+/* What the PWM pin of a motor gives, 0 to 1: phase correct, at the full clock with its top in ICR or as
+ * Arduino's analogWrite has it, or the port when the timer does not have the pin. */
 static double pwm(int index)
 {
     const struct pwm *pwm = &PWM[index];
     uint8_t a = avr->data[pwm->control_a], b = avr->data[pwm->control_b];
-    unsigned top = word(pwm->top), compare;
-    bool counts = (a & 3) == 2 && (b >> 3 & 3) == 2 && (b & 7) == 1 && top;
+    bool arduino = (a & 3) == 1 && !(b >> 3 & 3) && (b & 7) == 3;
+    unsigned top = arduino ? 255 : word(pwm->top), compare;
+    bool counts = arduino || ((a & 3) == 2 && (b >> 3 & 3) == 2 && (b & 7) == 1 && top);
     unsigned mode = a >> pwm->mode_shift & 3;
 
-    take_over(index, counts, top);
+    take_over(index, counts, top, arduino ? 64 : 1);
     compare = motors[index].timer.compare;
     if (!(avr->data[pwm->ddr] >> pwm->pin & 1))
         return 0.0;
@@ -963,8 +964,6 @@ static void power_on(const char *path)
     for (i = 0; i < firmware.symbolcount; i++)
         if (!strcmp(firmware.symbol[i]->symbol, "targets"))
             targets_at = (uint16_t)firmware.symbol[i]->addr;
-    if (!targets_at)
-        fail("%s: has no targets", path);
     avr->sleep = on_sleep;
     core_reset = avr->reset;
     avr->reset = on_reset;

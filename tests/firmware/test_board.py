@@ -24,7 +24,6 @@ from tests.firmware.board import (
     build_firmware,
     checked,
     passes,
-    read_identity,
     read_reply,
     speeds_line,
 )
@@ -96,28 +95,6 @@ def difference(before: int, after: int) -> int:
 # the contract
 
 
-def test_the_board_boots_stopped_and_sends_its_identity(board: Board, host: Host) -> None:
-    stays_off(board, 400)
-    board.command("reset")
-    assert host.says(b"acsard") == BY_PIN
-    assert stays_off(board, 400).on_ns == 0, "since power on"
-
-
-def test_the_motors_stop_300_ms_after_the_last_line(board: Board, host: Host) -> None:
-    by_board, by_wall = [], []
-    for _ in range(5):
-        host.drive(DRIVE, 0.25)
-        assert board.status().running
-        status = until(lambda: s if is_off(s := board.status()) else None, 3.0, "motors off")
-        by_board.append((status.off_ns - status.heard_ns) / MS)
-        by_wall.append((status.base_ns + status.off_ns - host.sent_ns) / MS)
-    print(f"silence -> motors off: {min(by_board):.1f} to {max(by_board):.1f} ms (board's time), "
-          f"{min(by_wall):.1f} to {max(by_wall):.1f} ms (wall)")  # fmt: skip
-    assert min(by_board) >= 250
-    assert max(by_board) <= 350
-    stays_off(board, 500)
-
-
 def test_an_integral_wound_up_before_a_stop_does_not_drive_after_it(
     board: Board, host: Host
 ) -> None:
@@ -128,23 +105,6 @@ def test_an_integral_wound_up_before_a_stop_does_not_drive_after_it(
     status = until(lambda: s if is_off(s := board.status()) else None, 3.0, "motors off")
     host.drive(STOPPED, 0.3)
     assert board.status().on_ns == status.on_ns, "not for a moment"
-
-
-def test_a_reset_while_driving_stops_the_board_until_a_stop_and_a_valid_line(
-    board: Board, host: Host
-) -> None:
-    host.drive(DRIVE, 0.3)
-    assert board.status().running
-    board.command("reset")
-    assert is_off(board.status())
-    assert host.says(b"acsard") == BY_PIN
-    stays_off(board, 400)
-    is_still(board)
-    host.stop()
-    host.write(b"ap10.00,bp10.00,cp10.00,dp10.00")  # not yet a whole line
-    stays_off(board, 100)
-    host.write(b"\r\n")
-    until(lambda: board.status().running, 3.0, "it drives again")
 
 
 @pytest.mark.parametrize(
@@ -181,55 +141,6 @@ BAD_LINES = [
 ]  # fmt: skip
 
 
-def test_garbage_changes_no_speed_and_is_not_answered(board: Board, host: Host) -> None:
-    for line in BAD_LINES:
-        host.send(line)
-    last = checked(speeds_line(DRIVE), 1)
-    host.send(last[:-1] + (b"0" if last[-1:] != b"0" else b"1"))
-    until(
-        lambda: board.status().to_board.last.startswith("ap10.00,bn05.00"),
-        3.0,
-        "all lines received",
-    )
-    assert stays_off(board, 100).on_ns == 0
-    assert host.lines() == []
-
-
-def test_neither_garbage_nor_a_question_feeds_the_watchdog(board: Board, host: Host) -> None:
-    host.drive(DRIVE, 0.3)
-    fed = board.status().heard_ns
-    while (status := board.status()).running:
-        host.send(BAD_LINES[-5])
-        host.send(b"?")  # a question is answered, and feeds it as little
-        host.lines(0.005)
-    print(f"stopped {(status.off_ns - fed) / MS:.1f} ms after the last good line, garbage since")
-    assert 250 <= (status.off_ns - fed) / MS <= 350
-
-
-def test_after_a_boot_the_board_refuses_every_line_until_a_stop(board: Board, host: Host) -> None:
-    """The board answers each refused line with its identity.
-
-    So a host that did not notice the reset and still sends speeds cannot move the robot.
-    """
-    lines = (speeds_line(DRIVE), checked(speeds_line(DRIVE), 1, "S"), speeds_line((0, 0, 0, 0.01)))
-    for refused, line in enumerate(lines):
-        host.send(line)
-        assert read_identity(host.says(b""))[4:] == (0, refused, 0, 0, "power")
-    assert host.identity().refused == 3
-    assert stays_off(board, 50).on_ns == 0
-    host.stop()
-    host.drive(DRIVE, 0.2)
-    host.identity()  # Its answer says that no line is on its way any more, to be refused too.
-    board.command("reset")
-    assert host.says(b"acsard") == BY_PIN
-    host.send(checked(speeds_line(DRIVE), 1, "S"))
-    assert host.says(b"") == BY_PIN
-    stays_off(board, 50)
-    host.stop()
-    host.drive(DRIVE, 0.2)
-    assert board.status().running
-
-
 def test_the_board_counts_lines_refusals_and_watchdog_stops(board: Board, host: Host) -> None:
     assert host.identity() == (3200, 300, 1, 1, 0, 0, 0, 0, "power")
     for line in BAD_LINES[1:]:
@@ -264,40 +175,6 @@ def reached(board: Board, host: Host, speeds: Speeds, seconds: float = 1.0) -> l
     return host.drive(speeds, 0.5)
 
 
-@pytest.mark.parametrize("speeds", [DRIVE, (-1.0, 2.0, -40.0, 0.5)])
-def test_a_commanded_speed_is_reached_and_reported(
-    board: Board, host: Host, speeds: Speeds
-) -> None:
-    replies = reached(board, host, speeds)
-    status = board.status()
-    for motor, wanted in enumerate(speeds):
-        reports = [reply.speeds[motor] for reply in replies]
-        true = status.motors[motor].speed
-        mean, noise = statistics.mean(reports), statistics.pstdev(reports)
-        print(f"{'abcd'[motor]}: wanted {wanted}, turns {true:.3f}, says {mean:.3f} +- {noise:.3f}")
-        assert true == pytest.approx(wanted, rel=0.01, abs=0.02)
-        assert statistics.mean(reports) == pytest.approx(wanted, rel=0.005, abs=0.02)
-        assert all(value == pytest.approx(wanted, rel=0.02, abs=0.1) for value in reports)
-
-
-@in_steps
-def test_a_cut_removes_the_voltage_before_it_changes_the_direction(
-    board: Board, host: Host
-) -> None:
-    """Check that the direction input never changes while the motor has voltage.
-
-    A driver with one direction input reverses when that input falls.
-    """
-    for _ in range(3):
-        host.drive((30.0, -30.0, 20.0, -40.0), 0.25)
-        assert all(abs(motor.duty) > 0.3 for motor in board.status().motors)
-        assert is_off(passes(board, 400)), "motors off for silence"
-    assert [motor.flip_duty for motor in board.status().motors] == [0.0] * 4
-    board.command("encoder b swapped")
-    is_cut(board, host, (9.0, 9.0, 9.0, 9.0), 0.8)
-    assert [motor.flip_duty for motor in board.status().motors] == [0.0] * 4
-
-
 # replies
 
 
@@ -309,22 +186,6 @@ def test_each_line_is_answered_once_with_its_sequence(board: Board, host: Host) 
         assert (reply.milliseconds is not None) == (letters == "S")
     wire = board.status().from_board
     assert wire.bytes - len(POWERED_ON) - 4 == 86 * 41 + 85 * 62 + 85 * 41, "and nothing else"
-
-
-def test_a_plain_line_gets_a_plain_answer(board: Board, host: Host) -> None:
-    host.ask(checked(ZERO, 1, "S"))
-    reply = host.ask(ZERO)
-    assert (reply.line, reply.sequence) == (ZERO, None)
-
-
-def test_a_line_is_answered_within_three_milliseconds(board: Board, host: Host) -> None:
-    took = []
-    host.stop()
-    for i in range(50):
-        host.ask(checked(speeds_line(DRIVE), i, "S"))
-        took.append(board.status().answer_ns / MS)
-    print(f"line end -> first byte of the answer: {min(took):.2f} to {max(took):.2f} ms")
-    assert max(took) < 3.0
 
 
 def test_the_counts_are_the_true_counts(board: Board, host: Host) -> None:

@@ -21,6 +21,7 @@ from typing import NamedTuple
 
 import pytest
 
+from acsard.daemon.serial.device import baud_rate_of, set_baud_rate
 from tests.system.harness import ROOT, ZERO_LINE
 
 SCRIPT = ROOT / "deploy" / "systemd" / "acsard-stop"
@@ -167,6 +168,16 @@ def test_the_port_is_set_raw_at_its_baud_rate_and_keeps_dtr(
     assert not inputs & (termios.IXON | termios.IXOFF | termios.ICRNL)
     assert not control & termios.HUPCL, "closing would reset the board"
     assert control & termios.CLOCAL
+
+
+def test_a_rate_that_stty_does_not_know_stays_as_the_daemon_has_set_it(
+    tmp_path: Path, wire: Wire
+) -> None:
+    set_baud_rate(wire.slave, 250000)
+    ended = stop(config(tmp_path, f'[mcu]\nport = "{wire.name}"\nbaud_rate = 250000\n'))
+    assert (ended.code, ended.err, baud_rate_of(wire.slave)) == (0, "", 250000)
+    assert not termios.tcgetattr(wire.slave)[3] & (termios.ECHO | termios.ICANON)
+    assert wire.read_bytes() == STOP
 
 
 @pytest.mark.parametrize(

@@ -12,13 +12,22 @@ import termios
 import threading
 import tty
 from collections.abc import Callable, Iterator
+from typing import get_args
 
 import pytest
 from serial import SerialException
 
-from acsard.core.config.settings import Config, SimConfig
+from acsard.core.config.settings import Baud, Config, SimConfig
 from acsard.core.simulator.faults import USB_PACKET
-from acsard.daemon.serial.device import close, draining, open_raw, refusal, unsent
+from acsard.daemon.serial.device import (
+    baud_rate_of,
+    close,
+    draining,
+    open_raw,
+    refusal,
+    set_baud_rate,
+    unsent,
+)
 from acsard.daemon.serial.simulator_pty import Simulated
 from acsard.host import clock
 from acsard.host.errors import Exit, InUseError
@@ -55,6 +64,18 @@ def test_each_error_of_the_port_has_an_exit_code_and_a_text(
     assert refused.code is code
     assert str(refused).count("/dev/acsar_that_is_not") == 1
     assert words in str(refused)
+
+
+@each("baud_rate", get_args(Baud))
+def test_a_port_is_opened_and_changed_at_each_baud_rate(path: str, baud_rate: int) -> None:
+    device, again = open_raw(path, baud_rate), 115200
+    assert baud_rate_of(device.fileno()) == baud_rate
+    raw = termios.tcgetattr(device.fileno())
+    set_baud_rate(device.fileno(), again)
+    assert baud_rate_of(device.fileno()) == again
+    assert termios.tcgetattr(device.fileno())[:2] == raw[:2]
+    close(device, wait_s=1.0)
+    device.close()
 
 
 def test_an_empty_read_is_not_a_hang_up_and_a_hang_up_is_reported() -> None:

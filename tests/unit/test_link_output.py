@@ -106,7 +106,7 @@ def test_a_line_begins_with_a_line_end_only_after_a_torn_line(takes: int, prefix
 
 @settings(max_examples=100)
 @given(
-    baud=st.sampled_from([9600, 19200, 38400, 57600, 115200]),
+    baud=st.sampled_from([9600, 19200, 38400, 57600, 115200, 250000, 500000]),
     sends=st.lists(st.tuples(st.integers(0, 50 * MS), st.integers(0, 35)), min_size=1),
 )
 def test_no_bytes_ever_queue_on_the_wire(baud: int, sends: list[tuple[int, int]]) -> None:

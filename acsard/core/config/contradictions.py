@@ -10,10 +10,11 @@ import ipaddress
 import math
 from collections.abc import Callable
 from itertools import pairwise
+from typing import get_args
 
 from acsard.core.config import motion_rules, named_faults
 from acsard.core.config.partial import Rule, mistakes
-from acsard.core.config.settings import HYSTERESIS, SIMULATOR, Config, McuConfig, is_tls
+from acsard.core.config.settings import HYSTERESIS, SIMULATOR, Baud, Config, McuConfig, is_tls
 from acsard.core.config.validation import show
 from acsard.core.config.wire_time import (
     COMFORTABLE_USE,
@@ -161,7 +162,7 @@ def _wire_problems(config: Config) -> list[str]:
         return []
     ms = wire_ns(count, mcu.baud_rate) / 1e6
     most, good = (highest_rate(mcu.baud_rate, count, use) for use in (1.0, COMFORTABLE_USE))
-    bauds = [b for b in (19200, 38400, 57600, 115200) if wire_use(rate, b, count) <= 1.0]
+    bauds = [b for b in get_args(Baud) if wire_use(rate, b, count) <= 1.0]
     faster = f"mcu.baud_rate = {bauds[0]} or more; or " if bauds else ""
     return [
         f"control.rate = {rate:g}: a line of {count} B at {mcu.baud_rate} baud takes {ms:.1f} ms, "

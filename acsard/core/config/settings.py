@@ -123,7 +123,7 @@ Motor = Literal["+a", "-a", "+b", "-b", "+c", "-c", "+d", "-d"]
 EncoderCounts = Annotated[
     int, Meta(ge=0, le=100_000, extra={"unit": "per wheel turn (0 = unknown)"})
 ]
-Baud = Literal[9600, 19200, 38400, 57600, 115200]
+Baud = Literal[9600, 19200, 38400, 57600, 115200, 250000, 500000]
 
 
 class RobotConfig(Struct, frozen=True):

@@ -12,7 +12,7 @@ import serial
 from acsard.checkup.board import Wire
 from acsard.checkup.findings import WireLostError
 from acsard.core.values import NS_PER_S, Ns
-from acsard.daemon.serial.device import close, draining, open_raw, refusal
+from acsard.daemon.serial.device import close, draining, open_raw, refusal, set_baud_rate
 from acsard.host import clock
 from acsard.host.processes import Holder, master_of, waited_ns
 
@@ -41,9 +41,7 @@ class BlockingPort(Wire):
             return
         fd = self._device.fileno()
         try:
-            attributes = termios.tcgetattr(fd)
-            attributes[4] = attributes[5] = getattr(termios, f"B{baud_rate}")
-            termios.tcsetattr(fd, termios.TCSADRAIN, attributes)
+            set_baud_rate(fd, baud_rate)
             termios.tcflush(fd, termios.TCIFLUSH)
         except (OSError, termios.error) as error:
             raise WireLostError(f"{self._path}: {error}") from error

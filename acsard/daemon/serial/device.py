@@ -6,11 +6,13 @@ import array
 import errno
 import fcntl
 import os
+import struct
 import termios
 from collections.abc import Iterator
 from contextlib import suppress
 
 import serial
+from serial.serialposix import BOTHER, TCGETS2, TCSETS2
 
 from acsard.core.values import Ns
 from acsard.host import clock
@@ -37,7 +39,7 @@ def open_raw(path: str, baud_rate: int) -> serial.Serial:
     try:
         device.open()
         _set_up(device)
-    except (OSError, termios.error) as error:
+    except (OSError, termios.error, ValueError) as error:  # ValueError: of a rate without constant
         if device.is_open:
             unlock(device.fileno())
         device.close()
@@ -65,6 +67,27 @@ def _set_up(device: serial.Serial) -> None:
         pass  # a pty and CDC-ACM lack this mode
     device.reset_input_buffer()
     device.reset_output_buffer()
+
+
+# termios2 of the kernel: the four flags, discipline and control characters, the two speeds. It has
+# any baud rate, but Python's termios has no constant for 250000.
+_TERMIOS2 = struct.Struct("4I20s2I")
+
+
+def baud_rate_of(fd: int) -> int:
+    """Return the port's baud rate."""
+    *_, baud_rate = _TERMIOS2.unpack(fcntl.ioctl(fd, TCGETS2, bytes(_TERMIOS2.size)))
+    return int(baud_rate)
+
+
+def set_baud_rate(fd: int, baud_rate: int) -> None:
+    """Set the baud rate when the driver has sent all bytes. Raises `OSError`, `termios.error`."""
+    termios.tcdrain(fd)
+    iflag, oflag, cflag, lflag, rest, *_ = _TERMIOS2.unpack(
+        fcntl.ioctl(fd, TCGETS2, bytes(_TERMIOS2.size))
+    )
+    cflag = cflag & ~termios.CBAUD | BOTHER
+    fcntl.ioctl(fd, TCSETS2, _TERMIOS2.pack(iflag, oflag, cflag, lflag, rest, baud_rate, baud_rate))
 
 
 def unsent(fd: int) -> int:

@@ -9,7 +9,6 @@ import asyncio
 import errno
 import os
 import pty
-import termios
 import tty
 from typing import Self, get_args
 
@@ -21,7 +20,7 @@ from acsard.core.simulator.baud_mismatch import garbled
 from acsard.core.simulator.fake_mcu import FakeMcu
 from acsard.core.simulator.simulated_robot import Observation, WatchedMcu
 from acsard.core.simulator.true_messages import true_pose, turn_rate
-from acsard.daemon.serial.device import unlock
+from acsard.daemon.serial.device import baud_rate_of, set_baud_rate, unlock
 from acsard.host import clock
 from acsard.host.timerfd import TimerFd
 
@@ -64,9 +63,6 @@ class PtyEnd:
         os.close(self.slave)
 
 
-_RATES: dict[int, int] = {getattr(termios, f"B{rate}"): rate for rate in get_args(Baud)}
-
-
 class SimPty:
     """The simulated board at one end of a pty; `path` is the daemon's device in a `with` block."""
 
@@ -78,7 +74,8 @@ class SimPty:
     def __enter__(self) -> Self:
         self._end = PtyEnd()
         self.path = self._end.path
-        self._set_speed()
+        # In case the host sets none.
+        set_baud_rate(self._end.slave, self.mcu.baud_rate)
         loop = asyncio.get_running_loop()
         loop.add_reader(self._end.fileno(), self._read)
         loop.add_reader(self._timer.fileno(), self._advance)
@@ -99,15 +96,10 @@ class SimPty:
             self.mcu.receive(now_ns, garbled(data, self._speed(), self.mcu.baud_rate))
             self._arm()
 
-    def _set_speed(self) -> None:
-        # In case the host sets none.
-        attributes = termios.tcgetattr(self._end.slave)
-        attributes[4] = attributes[5] = getattr(termios, f"B{self.mcu.baud_rate}")
-        termios.tcsetattr(self._end.slave, termios.TCSANOW, attributes)
-
     def _speed(self) -> int:
         # The board's, for a rate that acsard does not support.
-        return _RATES.get(termios.tcgetattr(self._end.slave)[5], self.mcu.baud_rate)
+        rate = baud_rate_of(self._end.slave)
+        return rate if rate in get_args(Baud) else self.mcu.baud_rate
 
     def _advance(self) -> None:
         self._timer.expirations()
