@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
+from textwrap import dedent
 from typing import NamedTuple
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -23,7 +24,7 @@ PAGES += MANUAL
 
 _NOT_RUN = r"<!-- not run: (.*?) -->\n"
 _WHOLE_PAGE = re.compile(rf"\A# .*\n+{_NOT_RUN}")
-_FENCED = re.compile(rf"^(?:{_NOT_RUN})?```([a-z0-9]*)\n(.*?)^```$", re.M | re.S)
+_FENCED = re.compile(rf"^ *(?:{_NOT_RUN} *)?```([a-z0-9]*)\n(.*?)^ *```$", re.M | re.S)
 
 
 class Block(NamedTuple):
@@ -75,7 +76,7 @@ def blocks(*languages: str) -> list[Block]:
         for match in _FENCED.finditer(text):
             line = text.count("\n", 0, match.start(2)) + 1
             reason = match[1] or (whole[1] if whole else "")
-            found.append(Block(page, line, match[2], match[3], reason))
+            found.append(Block(page, line, match[2], dedent(match[3]), reason))
     return [block for block in found if block.language in languages or not languages]
 
 

@@ -18,7 +18,15 @@ HOME = "index.md"
 
 # Questions of users, the page that answers each, and words of the answer.
 QUESTIONS = {
+    "Why does the robot not move?": ("tutorial/why.md", "acsard echo state -n 1 --short"),
     "What does the code `battery_empty` mean?": ("reference/codes.md", "`battery_empty`"),
+    "Why does the code `not_newer` keep my program from driving?": (
+        "reference/reasons.md",
+        "`not_newer`",
+    ),
+    "How do I stop the robot, and release the stop?": ("explanation/latches.md", "srv/clear"),
+    "What must my program send before it drives?": ("explanation/arming.md", "zero"),
+    "How do I drive from Go?": ("howto/languages.md", "go run"),
     "What is the default of `wheel_radius`?": ("reference/settings.md", "`wheel_radius`"),
     "How do I change a setting for good?": ("howto/settings.md", "--keep"),
 }

@@ -124,9 +124,11 @@ def test_settings_for_zenoh_are_accepted(block: Block) -> None:
     zenoh.Config.from_json5(block.text)
 
 
-def test_the_subscribers_of_other_languages_in_the_readme_are_those_that_are_run() -> None:
+def test_the_subscribers_of_other_languages_are_those_that_are_run() -> None:
     """`tests/system/test_client_languages.py` runs these blocks with another key."""
-    calls = re.findall(r"`(session\.declare\w+\([^`]+)`", prose("README.md"))
+    calls = re.findall(
+        r"`(session\.declare\w+\([^`]+)`", prose("deploy/manual/pages/howto/languages.md")
+    )
     sources = [
         text_of(f"deploy/clients/{file}")
         for file in ("rust/src/main.rs", "typescript/src/follow.ts")

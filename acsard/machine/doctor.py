@@ -231,7 +231,8 @@ def clocks(running: Running) -> Iterator[Finding]:
             "warning",
             f"the daemon's clock is {abs(running.ahead_s):.1f} s {way} this machine's",
             "let NTP set the clocks of both machines (timedatectl), or let the clients echo the "
-            "key beat (deploy/clients/README.md): commands with an echo do not need a common clock",
+            "key beat (page explanation/age of the manual): commands with an echo do not need "
+            "a common clock",
         )
 
 

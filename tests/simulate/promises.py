@@ -2,8 +2,8 @@
 
 `Witness` knows when each command was really sent and when each stop and clear arrived, and it reads
 the lines on the wire with separate code. It shares nothing with the product. Each rule follows the
-documentation (`deploy/clients/README.md`, the README) and allows everything that the documentation
-allows. The first broken rule raises `BrokenError` with its name.
+manual and allows everything that the manual allows. The first broken rule raises `BrokenError` with
+its name.
 
 Times are true ns from the start. True time continues while the robot's clock stops in a suspend.
 """

@@ -44,7 +44,7 @@ def test_each_code_is_in_the_program() -> None:
 
 
 def test_the_page_lists_the_codes_of_the_sources_with_the_first_words_of_their_texts() -> None:
-    page = (PACKAGE.parent / "deploy/clients/README.md").read_text(encoding="utf-8")
+    page = (PACKAGE.parent / "deploy/manual/pages/reference/reasons.md").read_text(encoding="utf-8")
     table = page.partition("| code | first words of the reason |")[2].partition("\n\n")[0]
     listed = set()
     for row in table.splitlines()[2:]:

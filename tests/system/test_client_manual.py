@@ -1,4 +1,4 @@
-"""The README's examples in Python do what the README says, against a running daemon."""
+"""The manual's examples in Python do what it says, against a running daemon."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from typing import Any, NamedTuple
 
 import pytest
 
+from tests.pages import blocks
 from tests.system.bystander import lost
 from tests.system.harness import (
-    ROOT,
     Bus,
     Daemon,
     Finished,
@@ -37,8 +37,9 @@ class Outcome(NamedTuple):
 
 
 def code_blocks() -> list[str]:
-    """Return the Python code blocks of the README."""
-    return re.findall(r"^```python\n(.*?)^```", (ROOT / "README.md").read_text(), re.S | re.M)
+    """Return the Python code blocks of the pages about programs."""
+    pages = [f"deploy/manual/pages/{name}.md" for name in ("tutorial/program", "howto/languages")]
+    return [block.text for block in blocks("python") if block.page in pages]
 
 
 def kind(code: str) -> str:
@@ -107,12 +108,12 @@ def examples(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Outcome]:
     return outcomes
 
 
-def test_the_readme_has_the_three_examples() -> None:
+def test_the_manual_has_the_three_examples() -> None:
     assert sorted(map(kind, code_blocks())) == ["async", "first", "plain zenoh"]
 
 
 @pytest.mark.slow
-def test_the_first_example_of_the_readme_drives_one_metre_turns_and_prints_the_pose(
+def test_the_first_example_of_the_manual_drives_one_metre_turns_and_prints_the_pose(
     examples: dict[str, Outcome],
 ) -> None:
     ended, state, late = examples["first"]
@@ -129,7 +130,7 @@ def test_the_first_example_of_the_readme_drives_one_metre_turns_and_prints_the_p
 
 
 @pytest.mark.slow
-def test_the_async_example_of_the_readme_follows_the_robot_while_it_drives(
+def test_the_async_example_of_the_manual_follows_the_robot_while_it_drives(
     examples: dict[str, Outcome],
 ) -> None:
     ended, state, late = examples["async"]
@@ -140,7 +141,7 @@ def test_the_async_example_of_the_readme_follows_the_robot_while_it_drives(
 
 
 @pytest.mark.slow
-def test_the_plain_zenoh_example_of_the_readme_drives_one_metre_and_follows_the_odometry(
+def test_the_plain_zenoh_example_of_the_manual_drives_one_metre_and_follows_the_odometry(
     examples: dict[str, Outcome],
 ) -> None:
     ended, state, late = examples["plain zenoh"]
