@@ -1,4 +1,4 @@
-"""Tests of the events and counters about the connections of the bus."""
+"""What the daemon counts and reports about its TLS gateway and its routers."""
 
 from __future__ import annotations
 
@@ -16,51 +16,26 @@ def arrival(payload: bytes, encoding: str = "") -> Arrival:
     return Arrival(GATEWAY_KEY, True, payload, encoding, 0, None, "")
 
 
-class GatewayDaemon:
-    """The part of the daemon that records the reports of the TLS gateway."""
-
-    def __init__(self) -> None:
-        self.told, self.counters = GatewayFollower(), Counter[str]()
-
-    def hears(self, state: GatewayState) -> int | None:
-        sample = arrival(encode(state, "msgpack"), encoding_name("msgpack", "GatewayState"))
-        return self.told.receive(sample, self.counters)
-
-
 def test_each_gateway_start_and_each_check_that_found_it_full_is_counted_once() -> None:
-    daemon = GatewayDaemon()
-    for opened, crowded in ((7, 0), (7, 3), (7, 3), (7, 4), (9, 0), (9, 2)):
-        daemon.hears(GatewayState(opened, 255, crowded))
-    assert daemon.counters == {"gateway_opened": 2, "gateway_full": 6}
-
-
-def test_checks_that_found_the_gateway_full_before_the_daemon_started_are_counted() -> None:
-    daemon = GatewayDaemon()
-    daemon.hears(GatewayState(7, 255, 40))
-    assert daemon.counters == {"gateway_opened": 1, "gateway_full": 40}
-
-
-def test_the_end_of_the_certificate_is_returned_if_the_gateway_reports_it() -> None:
-    daemon = GatewayDaemon()
-    assert (
-        daemon.hears(GatewayState(7, 0, 0, 1_800_000_000_000_000_000)) == 1_800_000_000_000_000_000
-    )
-    assert daemon.hears(GatewayState(7, 0, 0)) is None
+    """Also the 40 checks before the daemon started."""
+    follower, counters = GatewayFollower(), Counter[str]()
+    states = [(7, 40), (7, 43), (7, 43), (7, 44), (9, 0), (9, 2)]
+    for opened, crowded in states:
+        state = GatewayState(opened, 255, crowded, 1_800_000_000_000_000_000 if crowded else 0)
+        sample = arrival(encode(state, "msgpack"), encoding_name("msgpack", "GatewayState"))
+        assert follower.receive(sample, counters) == (state.certificate_ends or None)
+    assert counters == {"gateway_opened": 2, "gateway_full": 46}
 
 
 @each(
     "payload",
     [
-        b"",
-        b"\xff",
-        b"{}",
-        b'{"opened": "now"}',
-        b"[]",
+        b"", b"\xff", b"{}", b'{"opened": "now"}', b"[]",
         b'{"opened": -1, "connections": 0, "full": 0}',
         b'{"opened": 1, "connections": 0, "full": 1' + b"0" * 30 + b"}",
         b'{"opened": 1, "connections": 0, "full": 0, "certificate_ends": 1' + b"0" * 400 + b"}",
     ],
-)
+)  # fmt: skip
 def test_an_unreadable_gateway_report_counts_nothing(payload: bytes) -> None:
     counters = Counter[str]()
     assert GatewayFollower().receive(arrival(payload), counters) is None
@@ -70,61 +45,44 @@ def test_an_unreadable_gateway_report_counts_nothing(payload: bytes) -> None:
 A, B = "tcp/127.0.0.1:7447", "tcp/robot.local:7447"
 
 
-class Daemon:
-    """The part of the daemon that records its connections to routers."""
-
-    def __init__(self) -> None:
-        self.told, self.counters = RouterFollower(), Counter[str]()
-
-    def hears(self, connected: tuple[str, ...], missing: tuple[str, ...]) -> list[Event]:
-        events: list[Event] = []
-        self.told.receive(RoutersStatus(connected, missing), self.counters, events)
-        return events
+def told(*looks: RoutersStatus) -> tuple[list[list[Event]], Counter[str]]:
+    """Return the events of each look at the routers, and the counters after the last one."""
+    follower, counters, events = RouterFollower(), Counter[str](), list[list[Event]]()
+    for look in looks:
+        events.append([])
+        follower.receive(look, counters, events[-1])
+        assert follower.status == look
+    return events, counters
 
 
-def test_a_router_that_is_missing_from_the_start_is_reported_and_counted() -> None:
-    daemon = Daemon()
-    (event,) = daemon.hears((), (A,))
-    assert (event.name, event.level) == ("router_missing", "warning")
-    assert event.text == (
+def test_a_router_that_is_missing_or_connects_is_reported_once() -> None:
+    ((lost,), (found,), nothing), counters = told(
+        RoutersStatus((), (A,)), RoutersStatus((A,)), RoutersStatus((A,))
+    )
+    assert (lost.name, lost.level) == ("router_missing", "warning")
+    assert lost.text == (
         f"not connected to {A}; the daemon tries again until it connects, and the robot can drive "
         "meanwhile"
     )
-    assert daemon.counters == {"router_missing": 1}
+    assert (found, nothing) == (Event("router_found", f"connected to {A}"), [])
+    assert counters == {"router_missing": 1}
 
 
-def test_a_router_that_connects_is_reported_once_with_its_address() -> None:
-    daemon = Daemon()
-    daemon.hears((), (A,))
-    assert daemon.hears((A,), ()) == [Event("router_found", f"connected to {A}")]
-    assert daemon.hears((A,), ()) == []
-    assert daemon.told.status == RoutersStatus((A,), ())
-
-
-def test_only_the_missing_router_of_two_is_reported() -> None:
-    daemon = Daemon()
-    assert [e.name for e in daemon.hears((A, B), ())] == ["router_found"]
-    (event,) = daemon.hears((A,), (B,))
-    assert B in event.text
-    assert A not in event.text
+def test_of_two_routers_only_that_which_changed_is_reported() -> None:
+    ((found,), (lost,), both), counters = told(
+        RoutersStatus((A, B)), RoutersStatus((A,), (B,)), RoutersStatus((B,), (A,))
+    )
+    assert found.name == "router_found"
+    assert (B in lost.text, A in lost.text) == (True, False)
+    assert [event.name for event in both] == ["router_missing", "router_found"]
+    assert counters == {"router_missing": 2}
 
 
 def test_a_peer_in_the_place_of_a_router_is_reported_once_with_its_consequence() -> None:
-    follower, counters = RouterFollower(), Counter[str]()
-    events: list[Event] = []
-    follower.receive(
-        RoutersStatus((A,)), counters, events
-    )  # the type of this peer is not known yet
-    follower.receive(RoutersStatus((A,), peers=(A,)), counters, events)
-    follower.receive(RoutersStatus((A,), peers=(A,)), counters, events)
-    pairs = [(event.name, event.level) for event in events]
-    assert pairs == [("router_found", "info"), ("not_a_router", "warning")]
-    assert events[-1].text.startswith(f"these endpoints are peers, not routers: {A}. A peer, ")
-    assert "call stop --id '*'" in events[-1].text
-
-
-def test_one_router_may_go_missing_while_another_connects() -> None:
-    daemon = Daemon()
-    daemon.hears((A,), (B,))
-    assert [e.name for e in daemon.hears((B,), (A,))] == ["router_missing", "router_found"]
-    assert daemon.counters == {"router_missing": 2}
+    # At first, the type of this peer is not known yet.
+    peer = RoutersStatus((A,), peers=(A,))
+    ((found,), (event,), nothing), _ = told(RoutersStatus((A,)), peer, peer)
+    assert (found.name, event.name, event.level) == ("router_found", "not_a_router", "warning")
+    assert event.text.startswith(f"these endpoints are peers, not routers: {A}. A peer, ")
+    assert "call stop --id '*'" in event.text
+    assert nothing == []

@@ -26,68 +26,45 @@ def arrival(payload: bytes, encoding: str = "", put: bool = True, via: Via = "na
     return Arrival("speed_limit", put, payload, encoding, 7, None, "", via, attachment)
 
 
-def limit_message(value: object, **fields: Any) -> Arrival:
+def typed(value: object, **fields: Any) -> Arrival:
     """Return a message in hand-written JSON."""
     return arrival(json.dumps({"speed_limit": value} | fields).encode())
 
 
-@each("named", [True, False])
-@each("form", FORMATS)
-def test_a_speed_limit_is_read_in_every_encoding(form: Format, named: bool) -> None:
-    encoding = encoding_name(form, "SpeedLimit") if named else ""
-    assert decode_limit(arrival(encode(FULL, form), encoding), 0.5).speed == pytest.approx(0.2)
+LIMITS: list[tuple[Arrival, float | str | None]] = [
+    *((arrival(encode(FULL, form), encoding), 0.32) for form in FORMATS
+      for encoding in ("", encoding_name(form, "SpeedLimit"))),
+    # In m/s, or in percent of the configured 0.8 m/s. Zero means no limit.
+    (typed(0.3), 0.3), (typed(9.0), 9.0), (typed(1e-300), 1e-300), (typed(0.0), None),
+    (typed(-0.0), None), (typed(0.0, percentage=True), None), (typed(100.0, percentage=True), 0.8),
+    (typed(50.0, percentage=True), 0.4),
+    (typed(-0.1), "out_of_range"), (typed(-5.0, percentage=True), "out_of_range"),
+    (typed(100.1, percentage=True), "out_of_range"),
+    *((arrival(encode(SpeedLimit(Header(), share, value), "cdr")), "not_finite")
+      for value in (math.nan, math.inf, -math.inf) for share in (False, True)),
+    (arrival(b"{}"), "wrong_shape"), (typed("fast"), "wrong_shape"), (typed(None), "wrong_shape"),
+    (typed(0.3, percent=True), "wrong_shape"), (arrival(encode(FULL, "cdr")[:-1]), "malformed"),
+    (arrival(b'{"speed_limit": NaN}'), "malformed"), (arrival(b"0.5"), "unknown_encoding"),
+    (arrival(b"{" + b" " * 5000), "too_big"),
+    (arrival(encode(FULL, "json"), put=False), "not_a_put"),
+]  # fmt: skip
 
 
-def test_in_json_only_the_number_is_required_and_is_in_metres_per_second() -> None:
-    assert decode_limit(limit_message(0.3), 1.0).speed == 0.3
-
-
-@each(
-    ("value", "percentage", "speed"),
-    [(0.0, False, None), (0.0, True, None), (-0.0, False, None), (100.0, True, 0.8),
-     (50.0, True, 0.4), (9.0, False, 9.0), (1e-300, False, 1e-300)],
-)  # fmt: skip
-def test_zero_means_no_limit_and_a_percentage_refers_to_the_configured_speed(
-    value: float, percentage: bool, speed: float | None
+@each(("message", "verdict"), LIMITS)
+def test_a_speed_limit_is_accepted_or_refused_with_its_reason(
+    message: Arrival, verdict: float | str | None
 ) -> None:
-    assert decode_limit(limit_message(value, percentage=percentage), 0.8).speed == speed
+    if isinstance(verdict, str):
+        with pytest.raises(DecodeError) as refusal:
+            decode_limit(message, 0.8)
+        assert refusal.value.reason == verdict
+    else:
+        assert decode_limit(message, 0.8).speed == (verdict and pytest.approx(verdict))
 
 
 def test_the_sender_of_a_limit_is_named() -> None:
     by = decode_limit(arrival(encode(FULL, "cdr"), via="rmw"), 1.0).by
     assert by == f"unnamed (rmw {(b'g' * 16).hex()}) on the key speed_limit"
-
-
-REFUSED: dict[str, list[Arrival]] = {
-    "out_of_range": [
-        limit_message(-0.1),
-        limit_message(-5.0, percentage=True),
-        limit_message(100.1, percentage=True),
-    ],
-    "not_finite": [
-        arrival(encode(SpeedLimit(Header(), share, value), "cdr"))
-        for value in (math.nan, math.inf, -math.inf)
-        for share in (False, True)
-    ],
-    "wrong_shape": [
-        arrival(b"{}"),
-        limit_message("fast"),
-        limit_message(0.3, percent=True),
-        limit_message(None),
-    ],
-    "malformed": [arrival(encode(FULL, "cdr")[:-1]), arrival(b'{"speed_limit": NaN}')],
-    "unknown_encoding": [arrival(b"0.5")],
-    "too_big": [arrival(b"{" + b" " * 5000)],
-    "not_a_put": [arrival(encode(FULL, "json"), put=False)],
-}
-
-
-@each("reason", REFUSED)
-def test_an_invalid_message_is_refused_with_its_reason(reason: str) -> None:
-    for message in REFUSED[reason]:
-        with pytest.raises(DecodeError) as refusal:
-            decode_limit(message, 1.0)
-        assert refusal.value.reason == reason
 
 
 DAMAGE = st.lists(st.tuples(st.integers(0, 200), st.binary(max_size=8)), min_size=1, max_size=4)

@@ -38,11 +38,9 @@ def numbers(subscription: Subscription) -> list[int]:
     return [sample.number for sample in samples]
 
 
-def test_a_sample_that_was_put_on_a_wildcard_does_not_count_for_the_key() -> None:
+def test_a_subscription_yields_the_samples_of_its_key_or_all() -> None:
+    # A sample that was put on a wildcard does not count for the key.
     assert numbers(Subscription(Queue(KEY, WILDCARD, WILDCARD, KEY), KEY)) == [0, 3]
-
-
-def test_a_subscription_without_a_key_yields_all_samples() -> None:
     assert numbers(Subscription(Queue(KEY, WILDCARD, KEY))) == [0, 1, 2]
 
 
@@ -75,11 +73,8 @@ class Closed(Queue):
         raise zenoh.ZError("already undeclared")
 
 
-def test_a_subscription_ends_when_its_session_is_closed() -> None:
+def test_a_subscription_ends_without_an_error_when_its_session_is_closed() -> None:
     assert numbers(Subscription(Closed(KEY, KEY))) == [0, 1]
-
-
-def test_a_closed_subscription_is_undeclared_without_an_error() -> None:
     Subscription(Closed()).undeclare()
 
 
