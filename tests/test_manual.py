@@ -28,6 +28,11 @@ QUESTIONS = {
     "What must my program send before it drives?": ("explanation/arming.md", "zero"),
     "How do I drive from Go?": ("howto/languages.md", "go run"),
     "What is the default of `wheel_radius`?": ("reference/settings.md", "`wheel_radius`"),
+    "How do I install it without internet?": ("howto/install-package.md", "dpkg --install"),
+    "How do I undo an upgrade?": ("howto/upgrade.md", "service rollback"),
+    "What happened at 14:05?": ("howto/what-happened.md", "show --from 14:05"),
+    "How do I let a laptop in?": ("howto/access.md", "tls init"),
+    "Which role may clear a stop?": ("reference/keys.md", "| operator | all of viewer"),
     "How do I change a setting for good?": ("howto/settings.md", "--keep"),
 }
 
@@ -86,3 +91,4 @@ def test_the_manual_builds_strictly_and_loads_nothing_from_other_servers(site: P
         )
         assert loads
         assert not [target for target in loads if "//" in target], path
+        assert "|---" not in path.read_text(), f"{path}: a table is not rendered"

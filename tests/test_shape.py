@@ -194,13 +194,13 @@ def logged() -> set[str]:
     return names
 
 
-def test_the_names_of_events_are_a_closed_set_that_the_page_of_the_service_lists() -> None:
+def test_the_names_of_events_are_a_closed_set_that_the_manual_lists() -> None:
     events, names = get_args(EventName), logged()
     assert len(names) > 15
     assert names <= set(events)
     code = "".join(text for module, text in CODE.items() if module != "core/values.py")
     assert not {n for n in {*events} - {*get_args(Verb)} if f'"{n}"' not in code}
-    page = (ROOT / "deploy/systemd/README.md").read_text(encoding="utf-8")
+    page = (ROOT / "deploy/manual/pages/reference/events.md").read_text(encoding="utf-8")
     table = page.partition("| meaning | event |")[2].partition("\n\n")[0]
     cells = [row.split("|")[2] for row in table.splitlines()[2:]]
     assert re.findall(r"`(\w+)`", "".join(cells)) == list(events)

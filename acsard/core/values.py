@@ -196,7 +196,7 @@ class Refusal(Struct, frozen=True, omit_defaults=True):
     arrived_ns: Ns = 0  # 0: unknown
 
 
-# Events in the log; `deploy/systemd/README.md` explains each.
+# Events in the log; `deploy/manual/pages/reference/events.md` explains each.
 EventName = Literal[
     "started", "ended", "signal", "configuration", "real_time", "connecting",
     "port_open", "port_waiting", "port_lost",

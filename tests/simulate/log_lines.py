@@ -1,6 +1,6 @@
 """The promises about the log: it contains each change of the mode, and its rate is limited.
 
-`deploy/systemd/README.md` states them. Times are in ns of the robot's monotonic clock.
+`reference/events.md` of the manual states them. Times are in ns of the robot's monotonic clock.
 """
 
 from __future__ import annotations

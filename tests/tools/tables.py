@@ -189,7 +189,6 @@ FILES: dict[str, Callable[[str], str]] = {
     "deploy/manual/pages/reference/keys.md": _marked("keys", keytable()),
     "deploy/ros2/README.md": ros_page,
     "deploy/ros2/zenoh-bridge-ros2dds.json5": bridge_file,
-    "deploy/systemd/README.md": service_page,
     "deploy/zenoh/router.json5": router_file,
     **{name: _whole(write) for name, write in GENERATED.items()},
 }

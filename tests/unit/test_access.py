@@ -330,7 +330,7 @@ def test_the_daemon_may_do_everything_at_the_gateway() -> None:
 
 @each("role", ROLES)
 def test_the_page_about_access_names_the_services_of_a_role(role: Role) -> None:
-    text = (Path(__file__).parents[2] / "deploy" / "systemd" / "README.md").read_text()
+    text = (Path(__file__).parents[2] / "deploy/manual/pages/reference/keys.md").read_text()
     (row,) = re.findall(rf"^\| {role} \| .*$", text, re.M)
     named = {verb for verb in SERVICES if re.search(rf"[`*]{verb}[`*]", row)}
     assert named == {verb for verb, least in SERVICE_ROLES.items() if least == role}
