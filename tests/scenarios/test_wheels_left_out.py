@@ -21,7 +21,7 @@ from acsard.core.simulator.faults import Fault
 from acsard.core.values import NS_PER_S, WHEELS, Estimate, Event, Instant
 from tests.scenarios.imperfect_gyro import ImperfectGyro
 from tests.scenarios.world import World
-from tests.unit.liars import Plain
+from tests.unit.odometer import Plain
 
 COUNTS = SimConfig().encoder_counts
 

@@ -11,7 +11,7 @@ from acsard.core.motion.gyro import Gyro, claims
 from acsard.core.motion.kinematics import Kinematics, on_arc
 from acsard.core.motion.odometry import Odometry
 from acsard.core.motion.uncertainty import ErrorModel
-from acsard.core.values import Estimate, Pose
+from acsard.core.values import Estimate, Pose, WheelSpeeds
 
 
 class Odometer:
@@ -35,7 +35,9 @@ class Odometer:
         """Use this gyro, whether one is configured or not."""
         self.checks.gyro, self.model.claims = gyro, self._claims
 
-    def fold(self, line: Feedback) -> Estimate:
+    def fold(self, line: Feedback, commanded: WheelSpeeds | None = None) -> Estimate:
+        if commanded is not None:
+            self.checks.wheels.commanded = commanded
         return self.odometry.fold(line, self.checks, self.model)
 
     def skip(self, line: Feedback) -> None:
@@ -51,3 +53,15 @@ def arc(pose: Pose, distance: float, turn: float) -> Pose:
     yaw = math.remainder(pose.yaw, math.tau)
     dx, dy, yaw = on_arc(yaw, distance, turn)
     return Pose(pose.x + dx, pose.y + dy, yaw)
+
+
+class Plain:
+    """Odometry that integrates the mean of front and rear wheels and excludes no wheel."""
+
+    def __init__(self) -> None:
+        self._kinematics, self.pose = Kinematics(DriveConfig()), Pose()
+
+    def fold(self, line: Feedback) -> None:
+        turned = WheelSpeeds(*(speed * line.dt for speed in line.speeds.as_tuple()))
+        twist = self._kinematics.twist(turned)
+        self.pose = arc(self.pose, twist.linear, twist.angular)

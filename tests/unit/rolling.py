@@ -86,10 +86,10 @@ class Findings(Struct):
 
 
 class Bench:
-    """One robot with its `Wheels`, step by step."""
+    """One robot with its `Wheels`, step by step. On a rough ground no step is like the last one."""
 
-    def __init__(self, robot: Robot, dice: random.Random) -> None:
-        self.robot, self.dice = robot, dice
+    def __init__(self, robot: Robot, dice: random.Random, rough: bool = True) -> None:
+        self.robot, self.dice, self.rough = robot, dice, rough
         self.kinematics = Kinematics(robot.drive)
         self.limits = robot.limits
         self.feedback = FeedbackConfig(response_time=robot.response_time)
@@ -111,6 +111,7 @@ class Bench:
         self.dead: set[int] = set()  # encoders
         self.signs: dict[int, int] = {}  # of encoders
         self.frozen: dict[int, float] = {}  # encoders that repeat a speed
+        self.slips: dict[int, float] = {}  # factor of the motion of a wheel
         self.rolled = [0.0] * 4  # rad, magnitudes
         self.said = Findings()
         self.cap = math.inf
@@ -129,10 +130,11 @@ class Bench:
             if self.hand is not None:
                 goal, lag = self.hand[i], 0.1
             before = self.speeds[i]
-            goal *= self.dice.uniform(0.98, 1.02)
+            goal *= self.dice.uniform(0.98, 1.02) if self.rough else 1.0
             speed = before if i in self.keeps else goal + (before - goal) * math.exp(-dt / lag)
             self.speeds[i] = speed
-            moved = (before + speed) / 2 * dt * self.dice.uniform(0.95, 1.05)
+            moved = (before + speed) / 2 * dt * self.slips.get(i, 1.0)
+            moved *= self.dice.uniform(0.95, 1.05) if self.rough else 1.0
             self.angles[i] += moved
             self.rolled[i] += abs(moved)
             counted = math.floor(self.angles[i] / self.unit)

@@ -20,7 +20,6 @@ from tests.unit.link_bench import BAD, CHECKED, GOOD, MS, PLAIN, LinkBench
 from tests.vectors.lines import SEED_LINE, ZERO
 
 law = settings(max_examples=100)
-PLAIN_LINE = SEED_LINE + b"\r\n"
 REPLY = b"ap12.50,bn08.75,cp15.00,dn10.25#07*585F"
 SAMPLE = b"ap12.50,bn08.75,cp15.00,dn10.25#07@0FA00001FFFF80007FFF"
 
@@ -347,17 +346,6 @@ def test_a_movement_beyond_the_fastest_speed_is_a_leap(motor: int, sign: int) ->
     moved[motor] += 2 * sign
     assert board.read(10, tuple(moved)) == "leap"
     assert board.goes_on()
-
-
-def test_a_reading_read_late_or_a_clock_that_drifts_is_no_restart_and_hides_none() -> None:
-    board = Board()
-    assert board.read(10, (50, 50, 50, 50), host_ms=300) == turned(50, 50, 50, 50)
-    # The board made no reading while the host slept.
-    assert isinstance(board.read(295, (50, 50, 50, 50), host_ms=15), Turned)
-    for drift in (0.995, 1.005):
-        for _ in range(2000):
-            assert isinstance(board.read(10, host_ms=10 * drift), Turned)
-    assert board.read(125, host_ms=10.0) == "restarted"
 
 
 @law

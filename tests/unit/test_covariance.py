@@ -16,7 +16,7 @@ from acsard.core.motion.kinematics import Kinematics
 from acsard.core.motion.uncertainty import UNKNOWN_POSE, ErrorModel
 from acsard.core.values import Estimate, Pose, PoseCovariance
 from tests.each import each
-from tests.unit.nees import PERIOD, RADIUS, TRACK, Model
+from tests.unit.nees import PERIOD, RADIUS, TRACK
 from tests.unit.odometer import Odometer
 from tests.unit.test_pose import Says, counts, feedback, line, moves
 
@@ -218,18 +218,6 @@ def test_a_filled_gap_of_a_robot_within_its_limits_is_in_the_covariance(seconds:
         assert abs(found - true) <= limit * seconds**2 / 4 + 0.01 * limit * seconds
 
 
-def test_errors_of_many_equal_silences_add_up() -> None:
-    """In each silence the robot brakes at its end, so that the trapezoid lacks the same motion."""
-    robot, true = Odometer(EXACT), 0.0
-    for _ in range(50):
-        robot.fold(line(10.0, 0.01, driven=1.0))
-        estimate = robot.fold(line(0.0, 0.31, bridged=0.3, driven=0.3))
-        true += 10.0 * RADIUS * 0.31
-    missing = true - estimate.pose.x
-    assert missing == pytest.approx(50 * 10.0 * RADIUS * 0.15, rel=0.1)
-    assert missing < 2.0 * math.sqrt(estimate.covariance.xx)
-
-
 @each(("driven_s", "moved"), [(0.3, True), (-0.2, False)])
 def test_a_robot_that_was_commanded_to_move_may_have_moved_between_two_rests(
     driven_s: float, moved: bool
@@ -260,12 +248,6 @@ def test_a_pose_that_is_set_in_a_silence_knows_that_a_part_of_it_came_before(sha
 # the error model
 
 
-def test_a_certain_parameter_has_no_effect() -> None:
-    model = ErrorModel(OdometryConfig(gyro_scale_std=0.0), Kinematics(DriveConfig()))
-    assert model.bending == []
-    assert not any(any(effect) for effects in model.effects for effect in effects)
-
-
 @each(
     ("setting", "distance", "turn"),
     [
@@ -284,12 +266,6 @@ def test_an_effect_is_the_error_for_one_standard_deviation(
     ]
     assert of_distance * 2.0 + of_turn * 3.0 == pytest.approx(distance)
     assert turn_of_distance * 2.0 + turn_of_turn * 3.0 == pytest.approx(turn)
-
-
-@each("noise", [(1e-4, 1e-4, 1e-2), (0.0, 1e-4, 0.0), (1e-4, 0.0, 1e-2)])
-def test_a_straight_has_the_variances_per_metre(noise: tuple[float, float, float]) -> None:
-    model = ErrorModel(Model(*noise).config(), Kinematics(DriveConfig()))
-    assert model.noise(2.0, 0.0, 0.0) == pytest.approx((2 * noise[0], 2 * noise[1], 0.0))
 
 
 # a turn that was missed
@@ -313,14 +289,6 @@ def test_after_a_missed_turn_each_axis_is_as_uncertain_as_the_robots_are_apart(
     for axis, errors in zip(stated, (along, aside), strict=True):
         assert axis > 0.9 * float(np.sqrt((errors**2).mean()))
     assert max(stated) < 5.0 * (missed + 1.5)
-
-
-@each("missed", [10.0**-exponent for exponent in range(1, 13)])
-def test_a_missed_turn_of_any_size_makes_the_robot_get_less_far(missed: float) -> None:
-    robot, estimate = astray(missed, 100)
-    # 1 - cos(e) is nearly e2 / 2, whose root mean square is sqrt(3) / 2 of the variance of e.
-    share = robot.odometry.uncertainty.astray / estimate.pose.x
-    assert share == pytest.approx(math.sqrt(0.75) * missed**2, rel=0.05, abs=0.0)
 
 
 # the twist

@@ -23,12 +23,10 @@ from tests.unit.nees import (
     Array,
     Heard,
     fold,
-    nees,
     plain,
     random,
     reports,
     study,
-    true_ends,
 )
 
 CALIBRATED = {"ratio_std": 0.0028, "track_std": 0.01, "scale_std": 0.002}
@@ -97,34 +95,6 @@ def bursts(a_minute: float) -> Heard:
     return lines_of
 
 
-@pytest.mark.soak
-@pytest.mark.parametrize("model", MODELS)
-def test_the_covariance_matches_the_pose_errors_after_bridged_bursts(model: str) -> None:
-    values = study(random, MODELS[model], runs=1000, drives=100, heard=bursts(2.0))
-    check(values, f"bursts, {model}", least=0.5)  # the drive obeys the limits by far
-
-
-@pytest.mark.slow
-def test_the_covariance_matches_the_pose_errors_after_fifty_gaps_at_cruise() -> None:
-    """The drive has 50 gaps of 150 ms in which the pose does not move."""
-    rng = np.random.default_rng(5)
-    drive = reports([(0.5, 0.02, 60.0)])
-    lines, at = [], 0
-    for start in range(100, 5900, 116):
-        lines += plain(drive[at:start])
-        after = drive[start + 14]
-        speeds = WheelSpeeds(after[1], after[0], after[0], after[1])
-        lines.append(Feedback(AT, speeds, 0.0, gap=0.15))
-        at = start + 15
-    lines += plain(drive[at:])
-    ends = true_ends([drive], 500, DEFAULT, rng)
-    values = nees(*fold(lines, DEFAULT), ends[:, 0])
-    inside = float((values < REGION).mean())
-    print(f"50 gaps: NEES {values.mean():.2f}, 95 % region holds {100 * inside:.1f} %")
-    assert 1.0 < values.mean() < 4.5  # each gap has the acceleration of the limits
-    assert inside > 0.92
-
-
 # encoders
 
 
@@ -169,9 +139,6 @@ def test_the_encoder_counts_of_a_straight_add_no_yaw_variance(counts: int) -> No
     _, by_counts = fold(counting(counts)(drive, rng), DEFAULT, counts)
     _, exact = fold(plain(drive), DEFAULT)
     assert by_counts[2, 2] == pytest.approx(exact[2, 2], rel=0.05)
-
-
-# the error model
 
 
 # the twist

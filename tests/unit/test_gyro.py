@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from msgspec.structs import replace
 
 from acsard.core.config.settings import DriveConfig, OdometryConfig
-from acsard.core.motion.gyro import STATUS_TEXTS, Gyro, claims
+from acsard.core.motion.gyro import Gyro, claims
 from acsard.core.motion.kinematics import Kinematics
 from acsard.core.values import NS_PER_S, GyroDoes, GyroSample
 from tests.each import each
@@ -144,10 +144,6 @@ class Bench:
 # a gyro that is not believed yet
 
 
-def test_every_state_has_a_text() -> None:
-    assert set(STATUS_TEXTS) == set(GyroDoes.__args__)  # type: ignore[attr-defined]
-
-
 def stirring(t: float) -> float:
     return 0.8 * math.sin(1.3 * t) + 0.5 * math.sin(3.1 * t + 1.0) + 1e-3
 
@@ -158,14 +154,6 @@ def test_a_gyro_that_is_mounted_upside_down_is_not_believed() -> None:
     none = bench.none
     bench.run(5.0, stirring)
     assert bench.none - none == 500
-
-
-def test_a_gyro_in_degrees_is_named_even_if_its_bias_never_becomes_known() -> None:
-    bench = Bench(bias=0.6, noise=20.0)
-    bench.noise, bench.distort = 0.2, lambda rate: 57.3 * rate
-    bench.run(2.0, 0.5)
-    assert bench.does == ["waiting for rest", "in degrees"]
-    assert bench.off == pytest.approx(0.0)
 
 
 def test_another_gyro_must_rest_and_prove_itself() -> None:
@@ -279,20 +267,7 @@ def test_a_gyro_that_later_reports_another_quantity_must_prove_itself_again(
     assert bench.run(1.0, 0.5).says == "used"
 
 
-def test_a_new_pose_ends_the_uncertainty_of_the_turns_before_it() -> None:
-    bench = Bench(noise=0.002).proved().run(0.5, 1.0, 0.2)
-    bench.gyro.forget_doubt()
-    bench.doubt = 0.0
-    assert abs(bench.run(1.0).doubt) < 0.01
-
-
 # uncertainty
-
-
-def test_the_declared_error_of_the_track_is_a_fraction_of_its_multiplier() -> None:
-    odometry = OdometryConfig(gyro_scale_std=0.0, wheel_separation_multiplier_std=0.2)
-    kinematics = Kinematics(DriveConfig(wheel_separation_multiplier=2.0))
-    assert claims(odometry, kinematics, 3200).scale == pytest.approx(0.1)
 
 
 @settings(max_examples=20)

@@ -15,7 +15,6 @@ from acsard.core.motion.gyro import Gyro, Turn
 from acsard.core.motion.kinematics import Kinematics
 from acsard.core.motion.uncertainty import ErrorModel
 from acsard.core.values import NS_PER_S, GyroSample, Instant, Twist, WheelSpeeds
-from tests.unit.liars import fold
 from tests.unit.odometer import Odometer
 
 KINEMATICS = Kinematics(DriveConfig())
@@ -129,7 +128,7 @@ class Turning:
                 continue
             at = Instant(self.now_ns, self.now_ns)
             line = Feedback(at, speeds, dt, bridged=bridged)
-            self.yaw_variance = fold(self.robot, line, command)[0].covariance.yawyaw
+            self.yaw_variance = self.robot.fold(line, command).covariance.yawyaw
             self.does.append(self.gyro.does)
 
     @property

@@ -62,10 +62,6 @@ def test_an_imu_is_read_in_every_encoding(form: Format, named: bool) -> None:
     assert sample == GyroSample(7, 12_000_000_005, 0.75, 4e-4)
 
 
-def test_in_json_only_the_angular_velocity_is_required() -> None:
-    assert reading(turning(-0.5)) == (GyroSample(7, None, -0.5, 0.0), "")
-
-
 @given(st.binary(max_size=400))
 def test_any_payload_is_a_sample_or_is_counted_as_refused(payload: bytes) -> None:
     counters = Counter[str]()
@@ -111,13 +107,6 @@ def test_a_refused_sample_is_counted_and_reported_with_its_reason(reason: str) -
     assert (event.name, event.kind, event.level) == ("imu_refused", reason, "warning")
 
 
-def test_a_negative_variance_is_refused() -> None:
-    with pytest.raises(DecodeError, match="the turn rate is below zero: -1"):
-        reading(
-            imu_message(angular_velocity={"z": 0.1}, angular_velocity_covariance=[0.0] * 8 + [-1.0])
-        )
-
-
 S = SILENCE_TIMEOUT_NS
 STORIES = [
     [(0, "one", "used"), (S // 2, "other", "refused"), (S - 1, "one", "used"),
@@ -161,16 +150,6 @@ def test_two_frames_of_senders_without_a_name_are_two_gyros() -> None:
         "a sender without a name (frame lidar_imu) sends gyro samples, but the daemon already uses "
         "those of a sender without a name (frame imu_link): end one of the two programs"
     )
-
-
-def test_a_second_gyro_without_a_name_is_refused_in_words() -> None:
-    gyro, events = GyroFollower(), list[Event]()
-    gyro.receive(turning(0.1, 0, "abc"), Counter(), events)
-    assert gyro.receive(replace(turning(0.1, 1, ""), via="rmw"), Counter(), events) is None
-    assert [event.text for event in events] == [
-        "a sender without a name sends gyro samples, but the daemon already uses those of session "
-        "ba7816bf8f01cfea: end one of the two programs"
-    ]
 
 
 def test_a_robot_with_its_own_gyro_never_follows_another_one() -> None:

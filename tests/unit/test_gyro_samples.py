@@ -39,24 +39,6 @@ def test_stamps_remove_the_jitter_of_the_transmission_and_one_wrong_stamp_spoils
     assert bench.off < 0.02 * bench.true
 
 
-@each("set_ms", [-15, -175, -240, 175])
-def test_an_adjustment_of_the_stamp_clock_makes_no_wrong_turn(set_ms: int) -> None:
-    bench = Bench(stamped=True).run(2.0)
-    bench.clock_ns += set_ms * MS
-    # 3 rad/s over a line and a sample is 0.06 rad.
-    assert max(bench.run(DT, n / 100).off for n in range(300)) < 0.07
-
-
-@each("back_ms", [150, 210, 230, 290, 400])
-def test_a_turn_that_was_assumed_during_a_silence_is_not_counted_twice(back_ms: int) -> None:
-    for rate in (1.0, -2.0):
-        bench = Bench(stamped=True).run(1.0, rate)
-        bench.held_back_ns = bench.now_ns + back_ms * MS
-        bench.run(2.0, rate)
-        assert bench.says == "used"
-        assert bench.off < 0.01 * abs(rate)
-
-
 def test_a_late_gyro_is_not_silent() -> None:
     bench = Bench(late_ms=150, sample_ms=100)
     for _ in range(5):

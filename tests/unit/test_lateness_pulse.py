@@ -160,16 +160,6 @@ async def test_a_command_that_waits_is_retried_at_its_time_and_only_once() -> No
     assert steps.all[2][0].mono_ns - at_ns > -0.1 * MS
 
 
-async def test_a_retry_that_is_no_longer_needed_runs_no_step() -> None:
-    steps = Steps()
-    async with steps.running(0.05):
-        steps.pace.retry_ns = clock.mono_ns() + 10 * MS
-        steps.wake()
-        steps.pace.retry_ns = None
-        steps.wake()  # this step has sent the command
-    assert len(steps.all) == 2
-
-
 async def test_a_port_that_a_step_finds_lost_runs_no_step_within_the_step() -> None:
     steps = Steps()
     steps.work = lambda: steps.pulse(clock.now())
@@ -190,18 +180,3 @@ async def test_an_exception_of_a_step_ends_the_run_and_a_later_event_runs_no_ste
     steps.pulse.stop()
     steps.wake()
     assert len(steps.all) == 1
-
-
-async def test_the_run_ends_when_a_step_says_so() -> None:
-    async with asyncio.timeout(5.0):
-        await Pulse().run(PERIOD_NS, lambda now, period: False, Pace(0, 1))
-
-
-async def test_an_event_after_the_last_period_runs_no_step() -> None:
-    steps = Steps()
-    async with steps.running(0.0, PERIOD_NS) as pulse:
-        pass
-    count = len(steps.all)
-    time.sleep(2 * PERIOD_NS / NS_PER_S)  # such as for a port that closes late
-    pulse(clock.now())
-    assert len(steps.all) == count

@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 import random
-from typing import get_args
 
-import pytest
 from msgspec.structs import replace
 
-from acsard.core.config.settings import FeedbackConfig, McuConfig, WheelMap
+from acsard.core.config.settings import FeedbackConfig, McuConfig
 from acsard.core.config.wire_time import wire_ns
 from acsard.core.link.feedback import MIN_INTERVAL_NS
 from acsard.core.link.link_setup import LinkSetup
-from acsard.core.link.link_state import BAD_LINES, GOOD_LINES, TRANSITIONS, Input, Link, State
+from acsard.core.link.link_state import BAD_LINES, GOOD_LINES, Input, Link, State
 from acsard.core.link.session import LONG_GAP_NS, McuSession
 from acsard.core.values import NS_PER_S, STILL, Instant, Received, WheelSpeeds
 from tests.each import each
@@ -27,7 +25,7 @@ from tests.unit.link_bench import (
     WALL_NS,
     LinkBench,
 )
-from tests.vectors.lines import SEED_LINE, SEED_MOTORS, ZERO
+from tests.vectors.lines import ZERO
 
 FREE = McuConfig(reply_period=0.01)
 NOISE = b"\x00\xf8~boot\r\n" + GOOD[:20]
@@ -138,11 +136,6 @@ class States:
         return self.link.state
 
 
-def test_every_state_goes_down_when_the_port_closes() -> None:
-    states = {state for state, sign in TRANSITIONS if sign == "closed"}
-    assert states == set(get_args(State)) - {"down"}
-
-
 @each(
     ("sign", "state"),
     [("closed", "down"), ("opened", "booting"), ("restarted", "booting"), ("damaged", "stale")],
@@ -153,16 +146,6 @@ def test_after_the_link_ends_good_lines_are_counted_from_zero(sign: Input, state
     assert states.good() == "up"
     states.link.apply(sign)
     assert states.link.state == states.good(GOOD_LINES - 1) == state
-
-
-def test_lines_further_apart_than_the_silence_limit_make_no_link() -> None:
-    states = States()
-    states.good(2, ms=101)
-    assert states.link.sparse_s == 0.0  # a single silence proves nothing
-    assert states.good(10, ms=101) == "booting"
-    assert states.link.sparse_s == pytest.approx(0.101)
-    states.good()
-    assert states.link.sparse_s == 0.0
 
 
 @each(("checked", "state"), [(False, "up"), (True, "stale")])
@@ -251,14 +234,6 @@ def test_the_bad_lines_of_an_update_make_one_event_for_each_reason(reads: int) -
     bench.wait(10, *([b"x\r\n" * 200 + b"ap99.99\r\n" + b"y" * 300 + b"\r\n"] * reads))
     rows = [(event.kind, event.count, event.text) for event in bench.session.events]
     assert rows == [("malformed", 201 * reads, "b'ap99.99'"), ("too_long", reads, "")]
-
-
-def test_lines_have_the_wheel_map_and_the_dialect_of_the_configuration() -> None:
-    mcu = McuConfig(wheels=WheelMap("-d", "+b", "+c", "-a"))
-    (feedback,) = LinkBench(mcu).open().wait(10, GOOD)
-    assert feedback.speeds == WheelSpeeds(10.25, -8.75, 15.0, -12.5)
-    setup = LinkSetup.of(McuConfig(trailing_comma=True), 100.0)
-    assert setup.codec.encode(WheelSpeeds(*SEED_MOTORS)) == SEED_LINE + b",\r\n"
 
 
 @each("restart", [lambda b: (b.close().wait(10), b.open().wait(10)), lambda b: b.wait(10, BOOTED)])

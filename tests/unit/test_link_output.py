@@ -251,12 +251,6 @@ def test_a_line_tells_when_rest_was_commanded_after_the_last_motion(mcu: McuConf
     assert driven_ms(bench, moves, rests, moves, rests) == 30
 
 
-def test_behind_a_stall_the_watchdog_has_stopped_the_motors_before_the_zeros() -> None:
-    bench = LinkBench(FREE, rate_hz=20.0).up()
-    assert driven_ms(bench, (SLOW, 10), (SLOW, 190), (STILL, 10)) == 200
-    assert driven_ms(bench, (SLOW, 10), (SLOW, 500), (STILL, 10), (STILL, 10)) == 310
-
-
 def test_zeros_that_did_not_leave_command_no_rest_and_checked_ones_do() -> None:
     bench = LinkBench(FREE).up()
     bench.line(SLOW)

@@ -147,11 +147,6 @@ def test_a_stale_link_is_blamed_on_the_board_unless_the_host_was_late(
     ]  # fmt: skip
 
 
-def test_a_late_simulator_is_not_reported_as_a_silent_board() -> None:
-    for steps, code in (((10, 10), "simulator_fault"), ((800,), "host_late")):
-        assert after(*steps, setup=SIMULATED).describe(SIMULATED, "stale").code == code
-
-
 @each(("port", "code"), [("sim", "simulator_fault"), ("/dev/board", "link_silent")])
 def test_lines_that_the_host_read_late_give_no_advice_about_the_board(port: str, code: str) -> None:
     bench, codes = LinkBench(McuConfig(port=port)).up(), set()

@@ -14,7 +14,7 @@ from acsard.core.motion.gaps import AT_REST, LONG_S, Rolled, Skipped, rolled_ove
 from acsard.core.motion.gyro import Gyro, Turn
 from acsard.core.values import Estimate, Instant, Pose, Twist, WheelSpeeds
 from tests.each import each
-from tests.unit.odometer import Odometer, arc
+from tests.unit.odometer import Odometer
 from tests.vectors.drive import PATHS, SEED_STEP, SEED_STEP_ARC, SEED_STEP_TWIST
 
 law = settings(max_examples=100)
@@ -62,11 +62,6 @@ def test_a_step_has_the_twist_of_the_seed_equations_and_ends_on_the_arc() -> Non
     assert same_pose(estimate.pose, SEED_STEP_ARC, tolerance=1e-10)
 
 
-@each("turn", [0.0, 5e-324, 1e-300, 1e-20, 1e-12, 1e-9, -1e-9])
-def test_an_arc_of_hardly_any_turn_is_a_straight_line(turn: float) -> None:
-    assert same_pose(arc(Pose(), 1.0, turn), (1.0, 0.0, turn))
-
-
 @law
 @given(path=moves)
 def test_there_and_back_the_same_way_ends_where_it_began(path: list[Three]) -> None:
@@ -99,29 +94,7 @@ def test_each_wheel_turns_by_its_own_speed() -> None:
     assert (odometry.twist, odometry.speeds, odometry.pose) == now
 
 
-def test_the_first_line_and_a_gap_move_nothing() -> None:
-    robot = Odometer()
-    estimate = robot.fold(line(10.0, 0.0))
-    assert (estimate.pose, estimate.positions) == (Pose(), (0.0,) * 4)
-    before = robot.fold(line(10.0, 0.1))
-    after = robot.fold(line(10.0, 0.0, gap=5.0))
-    assert (after.pose, after.positions) == (before.pose, before.positions)
-
-
-def test_setting_the_pose_wraps_its_yaw() -> None:
-    robot = Odometer()
-    robot.set_pose(Pose(1.0, 2.0, 7.0))
-    assert robot.pose == Pose(1.0, 2.0, 7.0 - math.tau)
-
-
 # counts
-
-
-def test_counts_move_the_robot_whatever_the_speed_and_duration_of_the_line() -> None:
-    estimate = Odometer().fold(counts(2.0, dt=99.0, speed=50.0))
-    assert same_pose(estimate.pose, (0.1, 0.0, 0.0))
-    assert estimate.positions == (2.0,) * 4
-    assert estimate.twist.linear == pytest.approx(2.5)
 
 
 @law
@@ -137,15 +110,6 @@ def test_counts_that_agree_with_the_speeds_make_the_same_path(path: list[Three])
     assert same_pose(by_counts.pose, (pose.x, pose.y, pose.yaw))
 
 
-def test_counts_over_a_gap_add_no_uncertainty_of_the_gap() -> None:
-    by_gap, at_once = Odometer(), Odometer()
-    by_gap.fold(counts(0.0, speed=10.0))
-    bridged = by_gap.fold(counts(5.0, dt=0.0, gap=0.5, speed=10.0))
-    whole = at_once.fold(counts(5.0, speed=10.0))
-    assert same_pose(bridged.pose, (whole.pose.x, whole.pose.y, whole.pose.yaw))
-    assert bridged.covariance == whole.covariance
-
-
 @each("after", [counts(1.0), line(20.0, 0.05)])
 def test_the_counts_of_skipped_lines_are_not_lost(after: Feedback) -> None:
     robot = Odometer()
@@ -153,13 +117,6 @@ def test_the_counts_of_skipped_lines_are_not_lost(after: Feedback) -> None:
         robot.skip(counts(1.0, speed=99.0))
     assert robot.fold(after).pose.x == pytest.approx(0.05 * 11)
     assert robot.fold(counts(0.0)).positions == pytest.approx((11.0,) * 4)
-
-
-def test_the_whole_counts_of_a_line_give_its_distance_whatever_its_speed_and_time() -> None:
-    robot = Odometer()
-    for dt in (0.01, 0.003, 0.017):
-        robot.fold(line(9.99, dt, counted=(0.1,) * 4))
-    assert robot.pose.x == pytest.approx(3 * 0.1 * 0.05)
 
 
 # gaps and skipped lines
@@ -285,12 +242,3 @@ def test_a_wheel_that_creeps_is_not_held(
         estimate = robot.fold(counts(then))
     assert estimate.positions == pytest.approx((end,) * 4, abs=slack)
     assert estimate.pose.x == pytest.approx(end * 0.05, abs=slack * 0.05)
-
-
-def test_no_count_of_a_rest_is_lost() -> None:
-    robot, _ = at_rest()
-    for _ in range(10):
-        robot.fold(counts(0.002))
-    estimate = robot.fold(counts(0.002, speed=1.0))
-    assert estimate.positions == pytest.approx((0.022,) * 4)
-    assert estimate.pose.x == pytest.approx(0.022 * 0.05)

@@ -89,27 +89,10 @@ def test_without_configured_counts_no_line_has_whole_counts_and_coarse_lines_are
     assert fine.coarse_lines == 0
 
 
-def test_after_forgetting_no_step_is_known() -> None:
-    recovery = CountRecovery()
-    recover(recovery, speeds(400))
-    recovery.forget()
-    (line,) = recover(recovery, speeds(400)[500:501])
-    assert line.steps == (math.inf,) * 4
-
-
 def test_no_counts_are_derived_from_speeds_if_the_line_has_its_own_counts() -> None:
     lines = recover(CountRecovery(), speeds(20), 20, counts=True)
     assert all(line.counted is None for line in lines)
     assert max(lines[-1].steps) == pytest.approx(math.tau / 20 / PERIOD, abs=0.01)
-
-
-def test_a_randomly_jumping_wheel_beside_three_fine_ones_is_not_a_coarse_encoder() -> None:
-    dice, recovery = random.Random(1), CountRecovery()
-    for _ in range(1000):
-        fine = [round(5.0 + dice.uniform(-0.1, 0.1), 2) for _ in range(3)]
-        speeds = WheelSpeeds(round(dice.uniform(-70.0, 70.0), 2), *fine)
-        line = recovery.recover_counts(Feedback(AT, speeds, 0.01), 0.0)
-    assert max(line.steps) < 1.0
 
 
 def steps_after(speeds: list[float], steps: Steps | None = None) -> Steps:
@@ -130,22 +113,6 @@ def test_the_quantization_step_is_unknown_until_enough_steps_were_seen() -> None
     assert steps.size == math.inf
     steps.add(0.2)
     assert steps.size < 0.3
-
-
-@pytest.mark.parametrize("counts", [16, 20, 96])
-def test_the_quantization_step_of_whole_counts_is_one_count(counts: int) -> None:
-    quantum, dice = math.tau / counts / 0.01, random.Random(2)
-    steps = steps_after([quantum * dice.randint(0, 1) for _ in range(6 * BLOCK_STEPS)])
-    assert steps.size == pytest.approx(quantum)
-
-
-@pytest.mark.parametrize("share", [0.3, 0.5, 0.8])
-def test_a_filter_reduces_the_quantization_step_by_its_share(share: float) -> None:
-    speed, speeds, quantum = 0.0, [], 31.4
-    for i in range(400):
-        speed += share * ((0.0 if i % 9 else quantum) - speed)
-        speeds.append(round(speed, 2))
-    assert steps_after([0.0, *speeds]).size > 0.4 * share * quantum
 
 
 def test_one_damaged_line_does_not_change_the_quantization_step() -> None:
@@ -239,26 +206,6 @@ def test_whole_counts_are_refuted_for_firmware_that_filters() -> None:
         a, b, c, d = np.round(speeds, 2).tolist()
         counter.turned((a, b, c, d), own)
     assert not counter.believed
-
-
-def test_a_repeated_line_of_firmware_that_filters_gives_no_whole_counts() -> None:
-    counter, speeds, dice, refuted = WholeCounts(96), np.zeros(4), random.Random(1), 0
-    for row, own, _ in lines(96, 0.0):
-        speeds = speeds + dice.uniform(0.2, 0.4) * (np.array(row) - speeds)
-        a, b, c, d = np.round(speeds, 2).tolist()
-        counter.turned((a, b, c, d), own)
-        if not counter.believed and any((a, b, c, d)):
-            refuted += 1
-            assert counter.turned((a, b, c, d), 0.3 * own) is None
-    assert refuted > 1000
-
-
-def test_slow_wheels_with_edge_timing_firmware_do_not_turn_a_count_in_each_line() -> None:
-    counter, total = WholeCounts(16), 0.0
-    for _ in range(200):
-        turned = counter.turned((0.5, 0.5, 0.5, 0.5), 0.01)
-        total += turned[0] if turned else 0.5 * 0.01
-    assert total == pytest.approx(1.0, abs=counter.angle)
 
 
 @pytest.mark.parametrize("counts", [96, 400, 3200])

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from time import process_time
 from typing import Any, Literal
 
 import pytest
@@ -122,14 +121,6 @@ def test_counts_have_the_wheel_map_and_are_used_only_if_they_are_configured() ->
 # boards for which only the reads give the time
 
 
-def reporting(bench: Bench, lines: int = 80) -> Bench:
-    """Let the host read this many lines one by one, every 10 ms."""
-    for _ in range(lines):
-        bench.timeline.written(bench.setup, bench.now_ns)
-        bench.line()
-    return bench
-
-
 def read(bench: Bench, ms: float, lines: int, silent: bool = False) -> list[Feedback]:
     """Read this many lines at once, `ms` after the last read.
 
@@ -144,13 +135,6 @@ def read(bench: Bench, ms: float, lines: int, silent: bool = False) -> list[Feed
         )
         for i in range(1, lines + 1)
     ]
-
-
-def test_a_new_session_forgets_the_clock_of_the_old_session() -> None:
-    bench = reporting(Bench(counts=0, period=0.01))
-    bench.timeline.forget()
-    assert bench.line(ms=20).gap == pytest.approx(0.02)
-    assert bench.line(ms=14).dt == 0.01
 
 
 @pytest.mark.parametrize("period", [20, 50])
@@ -238,33 +222,3 @@ def test_late_reads_neither_add_nor_lose_time() -> None:
         total += bench.line(ms=10 + late).dt
         bench.now_ns -= late * MS
     assert total == pytest.approx((bench.now_ns - began) / 1e9, abs=0.004)
-
-
-def test_answers_after_a_phase_of_sparse_replies_are_not_matched_to_old_lines() -> None:
-    bench = Bench(counts=0)
-    timeline = bench.timeline
-    for number in range(596):
-        timeline.written(bench.setup, bench.now_ns + 2 * MS)
-        bench.now_ns += 10 * MS
-        if number % 5 == 0:
-            read(bench, 0, 1)
-    lines = []
-    for number in range(60):
-        timeline.written(bench.setup, bench.now_ns + 2 * MS)
-        bench.now_ns += 10 * MS
-        if number >= 7:
-            lines += read(bench, 0, 1 if number > 7 else 8)  # the host stood still for eight lines
-    assert max(line.dt for line in lines) <= 0.08  # the duration of the stall
-    assert sum(line.dt for line in lines) == pytest.approx(0.6, abs=0.06)
-
-
-def test_a_free_running_board_that_was_silent_for_a_day_costs_no_period() -> None:
-    bench = Bench(counts=0, period=0.01)
-    for _ in range(100):
-        bench.line()
-    begin = process_time()
-    line = bench.line(ms=86_400_000.0, gap=True)
-    assert process_time() - begin < 0.02
-    assert line.gap == pytest.approx(86_400.0, abs=0.02)
-    for _ in range(100):
-        assert bench.line().dt == pytest.approx(0.01)

@@ -7,10 +7,9 @@ from typing import Any
 
 import pytest
 
-from acsard.core.config.settings import FeedbackConfig
 from acsard.core.link.feedback import Feedback
 from acsard.core.motion import sanity as module
-from acsard.core.motion.sanity import MAX_WHEEL_ACCELERATION, Sanity
+from acsard.core.motion.sanity import Sanity
 from acsard.core.values import WHEELS, Event, Instant, WheelSpeeds
 from tests.each import each
 
@@ -128,10 +127,6 @@ def test_lines(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     assert verdicts(Sanity(), some, fastest) == expected
 
 
-def test_the_limits() -> None:
-    assert (MAX_WHEEL_ACCELERATION, FeedbackConfig().wheel_speed) == (1500.0, 80.0)
-
-
 @each("wheel", range(4))
 def test_the_reason_names_the_wheel_and_the_setting(wheel: int) -> None:
     assert Sanity().impossible(line(-80.01, wheel), 80.0).startswith(WHEELS[wheel])
@@ -154,16 +149,6 @@ def test_forgetting_starts_over_but_the_last_line_is_still_compared() -> None:
     assert verdicts(sanity, [*fast, fast[0]], 20) == ".....x"
 
 
-@each("speed", [-79.0, -42.0, -10.0, 10.0, 42.0, 79.0])
-@each("seconds", [0.03, 0.04, 0.06, 0.1, 0.6])
-def test_a_damaged_line_that_covers_a_pause_is_no_fault_of_the_true_lines(
-    seconds: float, speed: float
-) -> None:
-    found = verdicts(Sanity(), [*lines(0, 0), line(speed, dt=seconds), *lines(*[0.0] * 5)])
-    assert found[4:] == "...."
-    assert "F" not in found
-
-
 @each("number", [1, 2])
 def test_one_count_is_never_too_fast_and_two_in_its_time_are(number: int) -> None:
     """A host that catches up after a stall may ask again after 4 ms.
@@ -176,21 +161,6 @@ def test_one_count_is_never_too_fast_and_two_in_its_time_are(number: int) -> Non
         more: dict[str, Any] = {given: turned}
         fast = line(number * count / 0.004, 0, count=count, **more)
         assert verdicts(Sanity(), [fast], 50) == ".x"[number == 2]
-
-
-def test_the_step_of_one_wheel_excuses_nothing_before_the_steps_of_the_others_are_known() -> None:
-    steps = (UNKNOWN, 99.0, UNKNOWN, UNKNOWN)
-    fast = Feedback(Instant(0, 0), only(1, 99.0), 0.01, steps=steps)
-    assert verdicts(Sanity(), [fast]) == "x"
-
-
-def test_a_slow_line_of_one_wheel_ends_only_the_fast_time_of_that_wheel() -> None:
-    sanity, names = Sanity(), []
-    for first in (0.0, 30.0, 30.0, 0.0, 30.0, 30.0, 30.0, 0.0):
-        fast = Feedback(Instant(0, 0), WheelSpeeds(first, 32.0), 0.01, steps=(UNKNOWN,) * 4)
-        names.append(sanity.impossible(fast, 20.0).partition(" ")[0])
-    # The limit and 2 / 5 of 32 rad/s are 32.8 rad/s, and with 2 / 6 they are 30.7 rad/s.
-    assert names == [""] * 5 + ["front_left"] * 3
 
 
 @each("counts", [16, 40, 96, 200])

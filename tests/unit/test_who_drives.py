@@ -81,25 +81,12 @@ def test_stories(stories: dict[str, str], reverse: bool) -> None:
             raise
 
 
-def test_a_choice_names_its_command() -> None:
-    one = Commanders(armed=True).play("high go")
-    assert one.choice() == Choice("high", GO, Wait("nothing"), one.now_ns)
-    one.play("reset; low go")
-    assert one.choice() == Choice("low", None, Wait("neutral", "low", 1.0, lasts=0.0))
-
-
 @each("before", ["zero", "go"])
 def test_the_latest_reset_counts_and_what_arrived_before_it_arms_nobody(before: str) -> None:
     one = Commanders()
     one.arbiter.require_neutral(one.now_ns + 100 * MS)
     one.arbiter.require_neutral(one.now_ns)
     one.play(f"50 high.a {before}; 300 high.a go > -")
-
-
-def test_a_new_arbiter_requires_a_zero() -> None:
-    arbiter, commands = Arbiter(), CommandsConfig(sources=SOURCES)
-    assert arbiter.accept(Command("high", GO, NS_PER_S), commands) is None
-    assert arbiter.choose(NS_PER_S, commands).twist is None
 
 
 def test_the_sources_are_listed_by_priority_with_the_age_of_their_last_accepted_command() -> None:
@@ -120,11 +107,6 @@ def test_a_stall_of_the_daemon_changes_no_sender_and_brings_none_back() -> None:
         )
     one = Commanders().play("wake; high zero; 100 wake; 200 wake > - ? high stalled")
     one.play("100 wake; 100 wake; 100 wake; 200 wake > - ? high command")
-
-
-def test_late_commands_do_not_restore_the_priority_of_a_silent_source() -> None:
-    one = Commanders(armed=True).prove_clock("high.a")
-    one.play("300 low go > low" + "; 50 low go; high.a zero@9000 ! stale > low" * 10)
 
 
 def test_a_new_timeout_applies_to_a_sender_that_drives() -> None:
@@ -152,14 +134,6 @@ def test_a_seventeenth_sender_is_refused_while_sixteen_are_live() -> None:
     one.play(";".join(f"1 high.{number} zero" for number in range(15)))
     one.play("1 high.more zero ! too_many_senders > high.a; 14 high.a go > high.a")
     one.play("10 high.more zero ! too_many_senders > high.a ? high senders")
-
-
-@each("what", ["high.{} back", "high.{} unreadable"])
-def test_strangers_that_are_not_armed_displace_nobody(what: str) -> None:
-    one = sixteen(15)
-    one.play(";".join("1 " + what.format(f"stranger{number}") for number in range(100)))
-    for number in range(15):
-        one.play(f"300 high.{number} go > high.{number}")
 
 
 def test_what_is_refused_displaces_nobody_and_each_source_has_its_own_places() -> None:

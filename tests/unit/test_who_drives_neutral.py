@@ -96,11 +96,6 @@ def test_what_a_network_held_back_does_not_arm() -> None:
     one.play("5 high.a go@400 ! stale; 5 high.a go@100 > -; 200 high.a go@0 > -")
 
 
-def test_a_refused_zero_arms_nobody() -> None:
-    one = Commanders().prove_clock("high.a").play("1 reset; 300 high.a nan ! not_finite")
-    one.play("high.a zero@3600000 ! stale; high.a go > -")
-
-
 def test_a_refused_zero_that_is_newer_ends_the_speed() -> None:
     one = Commanders(armed=True)
     assert one.accept(Command("high", GO, one.now_ns, sequence=1)) == ""
