@@ -30,7 +30,6 @@ from tests.unit.calibration_bags import (
     at,
     bag,
     converted,
-    motion,
 )  # fmt: skip
 
 pytestmark = pytest.mark.slow
@@ -72,21 +71,6 @@ def rows(header: str, lines: Sequence[str]) -> bytes:
     return "\n".join([header, *lines, ""]).encode()
 
 
-def test_one_straight_part_and_then_turns_give_the_track() -> None:
-    """The part that holds all straight driving is left out once, too."""
-    turn = 6 * np.pi / 0.8
-    made = motion([(3, 0, 0), (5, 0.4, 0), (1, 0, 0), (turn, 0, 0.8), (1, 0, 0), (turn, 0, -0.8),
-                   (1, 0, 0)])  # fmt: skip
-    rng, every = np.random.default_rng(4), slice(None, None, 10)
-    columns = (made[name][every] for name in ("t", "left", "right", "w"))
-    lines = [
-        f"{t:.3f},{a:.4f},{b:.4f},{w + 0.01 + rng.normal(0, 0.004):.5f}"
-        for t, a, b, w in zip(*columns, strict=True)
-    ]
-    result = found(rows("t,left,right,yaw_rate", lines))
-    require(result, BY_GYRO)
-
-
 @pytest.mark.parametrize("first", ["driver", "publisher"])
 def test_zeros_of_a_second_publisher_are_refused_with_the_cause(tmp_path: Path, first: str) -> None:
     def joint(made: Bag, number: int, t: float, left: float, right: float) -> None:
@@ -97,14 +81,6 @@ def test_zeros_of_a_second_publisher_are_refused_with_the_cause(tmp_path: Path, 
     directory = bag(joint).write(tmp_path / "drive")
     with refused(r"two series of angles alternate.*joint_state_publisher", SystemExit):
         converted(directory, *GYRO)
-
-
-def test_speeds_with_zeros_of_a_second_program_are_refused_with_the_cause() -> None:
-    t = np.arange(0, END, 0.02)
-    speeds = np.where(np.arange(len(t)) % 2, 0.0, at("left", t))
-    lines = [f"{a:.3f},{b:.4f},{b:.4f},{at('w', a):.4f}" for a, b in zip(t, speeds, strict=True)]
-    with refused("in column left, every other value is 0: two programs"):
-        found(rows("t,left,right,yaw_rate", lines))
 
 
 @pytest.mark.parametrize("gyro", [True, False])
@@ -167,23 +143,6 @@ def test_a_clock_that_is_set_back_begins_a_new_run_of_a_csv_file() -> None:
     assert result.runs == 2
 
 
-def test_a_clock_that_is_set_back_in_a_bag_is_a_cause_that_is_named(tmp_path: Path) -> None:
-    """The reader of bags sorts by the time of recording, so the two parts are mixed."""
-
-    def joint(made: Bag, number: int, t: float, left: float, right: float) -> None:
-        made.joints(set_back(t) + 0.002, set_back(t), WHEELS, [left, right] * 2)
-
-    directory = bag(joint, lambda made, t, w: made.imu(set_back(t) + 0.002, set_back(t), w))
-    with refused("clock was set back", SystemExit):
-        converted(directory.write(tmp_path / "drive"), *GYRO)
-
-
-def test_poses_with_a_covariance_are_read(tmp_path: Path) -> None:
-    made = bag(gyro=None, pose_hz=10.0, pose=lambda b, t, x, y, yaw: b.pose(
-        START + t, START + t, (x, y, 0.0), yaw, kind="PoseWithCovarianceStamped"))  # fmt: skip
-    require(found(converted(made.write(tmp_path / "drive"), *POSES)), BY_POSES)
-
-
 def test_a_gyro_that_hangs_is_used_up_to_there(tmp_path: Path) -> None:
     last = [0.0]
 
@@ -208,15 +167,6 @@ def test_angles_of_one_side_that_are_copied_to_the_other_give_way_to_the_speeds(
     require(found(data), BY_GYRO)
 
 
-def test_sides_that_are_copied_in_a_csv_file_are_refused_with_the_cause() -> None:
-    lines = [
-        f"{t:.3f},{at('right', t):.4f},{at('right', t):.4f},{at('w', t):.5f}"
-        for t in np.arange(0, END, 0.02)
-    ]
-    with refused("left and right are the same in every row"):
-        found(rows("t,left,right,yaw_rate", lines))
-
-
 def test_encoders_without_direction_are_named_as_the_cause(tmp_path: Path) -> None:
     t, step = bags.DRIVE["t"], bags.STEP
     up = {name: np.cumsum(np.abs(bags.DRIVE[name])) * step for name in ("left", "right")}
@@ -230,14 +180,6 @@ def test_encoders_without_direction_are_named_as_the_cause(tmp_path: Path) -> No
         found(data)
 
 
-def test_messages_with_one_joint_each_are_joined(tmp_path: Path) -> None:
-    def joint(made: Bag, number: int, t: float, left: float, right: float) -> None:
-        for at_s, name, angle in zip((0, 1, 2, 3), WHEELS, [left, right] * 2, strict=True):
-            made.joints(START + t + 0.002 + at_s * 1e-4, START + t, (name,), [angle])
-
-    require(found(converted(bag(joint).write(tmp_path / "drive"), *GYRO)), BY_GYRO)
-
-
 def test_poses_whose_y_axis_points_up_need_the_option_that_the_error_names(tmp_path: Path) -> None:
     made = bag(gyro=None, pose_hz=20.0, pose=lambda b, t, x, y, yaw: b.pose(
         START + t, START + t, (x, 0.02, -y), yaw, axis=1))  # fmt: skip
@@ -245,18 +187,6 @@ def test_poses_whose_y_axis_points_up_need_the_option_that_the_error_names(tmp_p
     with refused(r"turn about their y axis.*add --up y", SystemExit):
         converted(directory, *POSES)
     require(found(converted(directory, *POSES, "--up", "y")), BY_POSES)
-
-
-def test_a_body_that_is_taken_for_the_robot_for_three_seconds_changes_nothing(
-    tmp_path: Path,
-) -> None:
-    def pose(made: Bag, t: float, x: float, y: float, yaw: float) -> None:
-        if any(begin < t < begin + 1 for begin in (20, 40, 60)):
-            x, y, yaw = 2.5, -1.0, 1.3
-        made.pose(START + t, START + t, (x, y, 0.0), yaw)
-
-    made = bag(gyro=None, pose_hz=20.0, pose=pose).write(tmp_path / "drive")
-    require(found(converted(made, *POSES)), BY_POSES, 0.006)
 
 
 # What held before, and must go on holding.
@@ -291,31 +221,6 @@ def odd_joints(kind: str) -> bags.Joint:
 def test_odd_joints_give_the_same_values(tmp_path: Path, kind: str) -> None:
     made = bag(odd_joints(kind)).write(tmp_path / "drive")
     require(found(converted(made, *GYRO)), BY_GYRO)
-
-
-@pytest.mark.nightly
-@pytest.mark.parametrize("kind", ["milliseconds", "50 years", "fast", "since the boot"])
-def test_odd_clocks_of_the_gyro_give_the_same_values(tmp_path: Path, kind: str) -> None:
-    def gyro(made: Bag, t: float, rate: float) -> None:
-        stamp = {"milliseconds": 1000 * t, "50 years": START + t - 1.577e9,
-                 "fast": START + 1.005 * t, "since the boot": 12.0 + t}[kind]  # fmt: skip
-        made.imu(START + t + 0.002, stamp, rate)
-
-    made = bag(gyro=gyro).write(tmp_path / "drive")
-    require(found(converted(made, *GYRO)), BY_GYRO)
-
-
-def test_a_clock_that_jumps_ahead_makes_two_runs(tmp_path: Path) -> None:
-    def late(t: float) -> float:
-        return START + t + (7.0 if t > 40 else 0.0)
-
-    def joint(made: Bag, number: int, t: float, left: float, right: float) -> None:
-        made.joints(late(t) + 0.002, late(t), WHEELS, [left, right] * 2)
-
-    made = bag(joint, lambda b, t, w: b.imu(late(t) + 0.002, late(t), w)).write(tmp_path / "drive")
-    result = found(converted(made, *GYRO))
-    require(result, BY_GYRO)
-    assert result.runs == 2
 
 
 def test_two_frames_on_a_topic_are_refused_with_the_cause(tmp_path: Path) -> None:

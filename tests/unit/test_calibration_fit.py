@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 from msgspec import structs
 
-from acsard.calibration.fit import BIAS, GYRO_DELAY, fit, gyro_bias
+from acsard.calibration.fit import BIAS, GYRO_DELAY, fit
 from acsard.calibration.log import LogError, TapeReading
-from acsard.core.config.settings import Config, DriveConfig
+from acsard.core.config.settings import Config
 from tests.unit.calibration_logs import WAYS, fitted, ideal, multipliers, run, runs, usual
 from tests.unit.calibration_robots import (
     GUIDED,
@@ -183,18 +183,6 @@ def test_what_a_log_does_not_show_stays_as_configured_with_the_deviation_of_the_
     assert not found.sized
 
 
-def test_a_calibrated_robot_is_not_calibrated_again() -> None:
-    trip = usual()
-    track, left, right = multipliers(fitted(trip))
-    right_drive = DriveConfig(
-        wheel_separation_multiplier=track, left_wheel_radius_multiplier=left,
-        right_wheel_radius_multiplier=right,
-    )  # fmt: skip
-    again = fitted(trip, config=structs.replace(Config(), drive=right_drive))
-    assert multipliers(again) == pytest.approx([1.0] * 3, abs=2e-3)
-    assert not again.better
-
-
 def test_a_distance_by_tape_shows_the_size_of_the_wheels() -> None:
     ahead = drive(Robot(rng=np.random.default_rng(1)), [(1, 0, 0), (10, 0.4, 0), (1, 0, 0)])
     metres = 1.05 * float(abs(ahead.where[-1]))
@@ -215,15 +203,6 @@ def test_a_gyro_that_is_late_biased_and_interrupted_gives_the_same_track() -> No
     assert found.p[BIAS] == pytest.approx(0.03, abs=0.002)
     expected = multipliers(fitted(usual(), places=False))[0]
     assert multipliers(found)[0] == pytest.approx(expected, rel=0.01)
-
-
-def test_the_bias_is_that_of_a_rest_even_if_an_encoder_rocks_between_two_counts() -> None:
-    trip = drive(Robot(bias=0.02, rng=np.random.default_rng(5)), GUIDED)
-    rocks = np.where(trip.left == 0.0, 0.3 * (-1.0) ** np.arange(len(trip.left)), trip.left)
-    bias, std = gyro_bias(runs([replace(trip, left=rocks)], places=False))
-    assert bias == pytest.approx(0.02, abs=0.002)
-    assert std < 0.01
-    assert gyro_bias(runs([usual(plan=[(20, 0.3, 0.8)])], places=False))[0] == 0.0
 
 
 def test_a_log_without_a_sensor_beside_the_wheels_is_refused() -> None:

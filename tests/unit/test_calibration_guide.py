@@ -92,17 +92,6 @@ def test_a_guided_drive_finds_track_and_size_and_stays_on_the_floor(
     assert max(edges) <= FLOOR_M - SETUP.reach
 
 
-def test_a_distance_that_agrees_with_the_configured_size_does_not_veto_the_track() -> None:
-    robot = Robot(1.6, radius=0.05)
-    robot.method = "gyro"
-    log = guided("gyro", SETUP, robot, robot.ride)
-    (reading,) = log.runs[0].tape
-    for millimetres in range(-6, 7, 3):
-        moved = replace(reading, value=reading.value + millimetres / 1000)
-        runs = replace(log.runs[0], tape=(moved,)), *log.runs[1:]
-        assert calibrate(Log(runs, ()), Config(), "the drive").better, millimetres
-
-
 @pytest.mark.parametrize("misread", ["round", "slowly", "fast"])
 def test_a_turn_that_was_misread_is_named(misread: str) -> None:
     robot = Robot(1.6)
@@ -196,9 +185,3 @@ def test_impossible_distances_to_the_line_are_refused() -> None:
 def test_a_robot_that_cannot_be_guided_is_refused(text: str, words: str) -> None:
     with pytest.raises(LogError, match=words):
         Setup.of(parse(text.encode()))
-
-
-def test_a_log_of_nothing_but_readings_is_a_log() -> None:
-    robot = Robot(1.5)
-    log: Log = guided("tape", SETUP, robot, robot.ride)
-    assert [len(run.tape) for run in log.runs] == [2, 1, 1, 1]

@@ -92,11 +92,6 @@ def test_single_wrong_cells_are_left_out_with_a_note() -> None:
     assert log.notes == ("cells of left left out, far above others, such as 5000: 1",)
 
 
-def test_a_coarse_encoder_that_alternates_with_zero_is_read() -> None:
-    rows = [f"{0.01 * n:.3f},{15.7 * (n % 2)},{15.7 * (n % 3 == 0)},0.1" for n in range(900)]
-    assert len(read(text(rows)).runs) == 1
-
-
 def test_a_dead_wheel_is_refused_and_named() -> None:
     rows = [f"{0.05 * n:.3f},2,2,0,2,0.1" for n in range(200)]
     with pytest.raises(LogError, match="rl rolls otherwise than fl"):
@@ -108,11 +103,6 @@ def test_positions_that_are_repeated_in_later_rows_count_once() -> None:
     log = read(text(rows, "t,left,right,x,y"))
     assert len(log.runs[0].place) == 50
     assert log.notes == ("rows of x y and yaw left out, because they repeat the row before: 150",)
-
-
-def test_a_gyro_that_repeats_its_value_in_a_steady_turn_is_read() -> None:
-    rows = [f"{0.05 * n:.3f},1,3,0.5" for n in range(200)]
-    assert len(read(text(rows)).runs[0].gyro_t) == 200
 
 
 def test_a_distance_is_that_of_the_straightest_run_or_of_the_named_one() -> None:

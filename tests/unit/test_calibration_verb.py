@@ -34,16 +34,6 @@ def called(where: Path, log: str, *words: str, text: str = "# mine\n") -> int:
     return int(args.main(args))
 
 
-def test_the_result_is_printed_as_text_and_the_file_stays(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert called(tmp_path, GOOD) == 0
-    out = capsys.readouterr().out
-    assert "wheel_separation_multiplier" in out
-    assert "a turn of 360 deg errs by" in out
-    assert (tmp_path / "acsard.toml").read_text() == "# mine\n"
-
-
 def test_a_terminal_shows_what_a_long_fit_does_and_clears_the_line(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -97,24 +87,6 @@ def test_a_result_that_cannot_be_written_is_printed_before_the_error(
         called(tmp_path, GOOD, "--write")
     assert "wheel_separation_multiplier = " in capsys.readouterr().out
     assert (tmp_path / "acsard.toml").read_text() == "# mine\n"
-
-
-@pytest.mark.slow
-def test_a_distance_measures_the_wheels(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    straight = usual(plan=[(1, 0, 0), (10, 0.4, 0), (1, 0, 0)])
-    metres = 1.05 * abs(straight.where[-1])
-    log = usual().csv(places=False, run="turns")
-    log += straight.csv(places=False, run="straight").partition("\n")[2]
-    words = ["--distance", "straight=" + f"{metres:.3f}", "--write", "--json"]
-    assert called(tmp_path, log, *words) == 0
-    result = json.loads(capsys.readouterr().out)
-    written = parse((tmp_path / "acsard.toml").read_bytes())
-    assert written.drive.left_wheel_radius_multiplier == pytest.approx(1.05, rel=0.01)
-    # The tape's common uncertainty of all distances is stated apart, because it does not affect the
-    # heading.
-    deviations = result["settings"]
-    assert written.odometry.distance_scale_std == deviations["odometry.distance_scale_std"]
-    assert 0.0 < written.odometry.distance_scale_std < 0.005
 
 
 def test_a_refusal_ends_with_failure_and_an_object(

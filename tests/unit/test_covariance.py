@@ -3,22 +3,18 @@
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
-from msgspec.structs import replace
 
-from acsard.core.config.settings import DriveConfig, LimitsConfig, OdometryConfig
-from acsard.core.motion.gyro import Turn
-from acsard.core.motion.kinematics import Kinematics
-from acsard.core.motion.uncertainty import UNKNOWN_POSE, ErrorModel
+from acsard.core.config.settings import LimitsConfig, OdometryConfig
+from acsard.core.motion.uncertainty import UNKNOWN_POSE
 from acsard.core.values import Estimate, Pose, PoseCovariance
 from tests.each import each
 from tests.unit.nees import PERIOD, RADIUS, TRACK
 from tests.unit.odometer import Odometer
-from tests.unit.test_pose import Says, counts, feedback, line, moves
+from tests.unit.test_pose import counts, feedback, line, moves
 
 law = settings(max_examples=100)
 START = PoseCovariance(1e-6, 0.0, 0.0, 1e-6, 0.0, 1e-6)
@@ -174,18 +170,6 @@ def test_a_gap_of_years_leaves_a_variance_of_1e9_and_no_more() -> None:
     assert max(map(abs, robot.odometry.uncertainty.bend.added)) < 1.0
 
 
-@each("dt", [0.11, 0.0])
-def test_a_gyro_measures_the_turn_of_a_gap_between_speeds_of_single_counts(dt: float) -> None:
-    robot = Odometer()
-    robot.use(Says(always=Turn(0.0, 1e-6, 0.0, 1e-3)))
-    for speed in (0.0, 6.5, 0.0, 6.5):
-        estimate = robot.fold(line(speed))
-    before = estimate.covariance
-    after = robot.fold(line(0.0, dt, gap=0.11 - dt, bridged=max(0.0, dt - 0.01))).covariance
-    assert after.xx > before.xx + 1e-5
-    assert after.yawyaw < before.yawyaw + 1e-5
-
-
 def driven(accelerations: list[float], gap: tuple[int, int]) -> tuple[float, float, float]:
     """Drive with lines every 10 ms, of which those in `gap` are lost.
 
@@ -218,19 +202,6 @@ def test_a_filled_gap_of_a_robot_within_its_limits_is_in_the_covariance(seconds:
         assert abs(found - true) <= limit * seconds**2 / 4 + 0.01 * limit * seconds
 
 
-@each(("driven_s", "moved"), [(0.3, True), (-0.2, False)])
-def test_a_robot_that_was_commanded_to_move_may_have_moved_between_two_rests(
-    driven_s: float, moved: bool
-) -> None:
-    robot = Odometer(EXACT)
-    start = robot.fold(line(0.0)).covariance
-    silences: list[dict[str, Any]] = [{"dt": 0.51, "bridged": 0.5}, {"dt": 0.0, "gap": 0.5}]
-    for silence in silences:
-        estimate = robot.fold(line(0.0, driven=driven_s, **silence))
-        assert (estimate.covariance.xx > start.xx + 0.05**2) == moved
-        start = estimate.covariance
-
-
 @each("share", [0.0, 0.3, 1.0])
 def test_a_pose_that_is_set_in_a_silence_knows_that_a_part_of_it_came_before(share: float) -> None:
     """The line that ends the silence has the counts of all of it, and none says when they came."""
@@ -246,26 +217,6 @@ def test_a_pose_that_is_set_in_a_silence_knows_that_a_part_of_it_came_before(sha
 
 
 # the error model
-
-
-@each(
-    ("setting", "distance", "turn"),
-    [
-        ("distance_scale_std", 0.01 * 2.0, 0.0),
-        ("wheel_separation_multiplier_std", 0.0, -0.01 * 3.0),
-        ("wheel_radius_ratio_std", 0.01 * 3.0 * TRACK / 4, 0.01 * 2.0 / TRACK),
-    ],
-)
-def test_an_effect_is_the_error_for_one_standard_deviation(
-    setting: str, distance: float, turn: float
-) -> None:
-    config = replace(OdometryConfig(), **{setting: 0.01})
-    model = ErrorModel(config, Kinematics(DriveConfig()))
-    ((of_distance, of_turn, turn_of_distance, turn_of_turn),) = [
-        row for row in model.effects[0] if any(row)
-    ]
-    assert of_distance * 2.0 + of_turn * 3.0 == pytest.approx(distance)
-    assert turn_of_distance * 2.0 + turn_of_turn * 3.0 == pytest.approx(turn)
 
 
 # a turn that was missed

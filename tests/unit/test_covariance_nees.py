@@ -74,27 +74,6 @@ def test_the_covariance_matches_the_pose_errors(scenario: str, model: str) -> No
 # bursts of lost lines
 
 
-def bursts(a_minute: float) -> Heard:
-    """Return a function that loses bursts of 0.1 to 0.5 s of lines, this many a minute."""
-
-    def lines_of(drive: Array, rng: np.random.Generator) -> list[Feedback]:
-        lost, at = np.zeros(len(drive), dtype=bool), 0
-        while (at := at + 10 + int(rng.exponential(6000 / a_minute))) < len(drive) - 60:
-            length = int(rng.uniform(10, 50))
-            lost[at : at + length] = True
-            at += length
-        lines, missing = [], 0
-        for (left, right), was_lost in zip(drive.tolist(), lost, strict=True):
-            missing += bool(was_lost)
-            if not was_lost:
-                speeds, gap = WheelSpeeds(right, left, left, right), missing * PERIOD
-                lines.append(Feedback(AT, speeds, PERIOD + gap, bridged=gap))
-                missing = 0
-        return lines
-
-    return lines_of
-
-
 # encoders
 
 

@@ -101,16 +101,11 @@ class Guarded:
     "data",
     [
         b"", b"\r\n", b"?", b"ap01.00,bp01.00,cp01.00\r\n", b"ap01.00,bp01.00,cp01.00,dp01.00",
-        b"ap01.00,bp01.00,cp01.00,dp01.00\n\n", b"ap01.00,bp01.00,cp01.00,dp01.00,\r\n",
-        b"ap01.00,bp01.00,cp01.00,dp1.00\r\n", b"ap01.00,bp01.00,cp01.00,dp001.0\r\n",
-        b"ap01.00,bp01.00,cp01.00,dp01,00\r\n", b"ap01.00,bp01.00,cp01.00,dp 1.00\r\n",
-        b"ap01.00,bp01.00,cp01.00,dp+1.00\r\n", b"ap01.00,bp01.00,cp01.00,dp0x.00\r\n",
-        b"ap01.00,bp01.00,cp01.00,dp01.0_\r\n", b"ap01.00,bp01.00,cp01.00,dpnanan\r\n",
-        b"ap01.00,bp01.00,cp01.00,d-01.00\r\n", b"ap01.00,bp01.00,cp01.00,dP01.00\r\n",
+        b"ap01.00,bp01.00,cp01.00,dp01.00,\r\n", b"ap01.00,bp01.00,cp01.00,dp1.00\r\n",
+        b"ap01.00,bp01.00,cp01.00,dp001.0\r\n", b"ap01.00,bp01.00,cp01.00,dp01,00\r\n",
+        b"ap01.00,bp01.00,cp01.00,dpnanan\r\n", b"ap01.00,bp01.00,cp01.00,d-01.00\r\n",
         b"ap01.00,bp01.00,cp01.00,cp01.00\r\n", b"bp01.00,ap01.00,cp01.00,dp01.00\r\n",
-        b"Ap01.00,bp01.00,cp01.00,dp01.00\r\n", b"ap01.00;bp01.00;cp01.00;dp01.00\r\n",
         b"ap01.00 bp01.00,cp01.00,dp01.00\r\n", b"ap01.00, bp1.00,cp01.00,dp01.00\r\n",
-        b"ap100.00,bp01.00,cp1.00,dp1.00\r\n",
         # Of two lines at once, the MCU would obey the first before the guard saw it.
         b"ap01.00,bp01.00,cp01.00,dp01.00\r\n" * 2,
         b"ap90.00,bp90.00,cp90.00,dp90.00\r\nap01.00,bp01.00,cp01.00,dp01.00\r\n",
@@ -124,13 +119,6 @@ def test_what_is_not_one_line_of_the_dialect_becomes_stop(data: bytes) -> None:
 @given(data=st.binary(max_size=40).filter(lambda data: data != b"?\r\n"))
 def test_noise_never_passes(data: bytes) -> None:
     assert Guarded().check(data) == DAMAGED
-
-
-def test_a_guard_for_trailing_commas_passes_only_lines_with_one() -> None:
-    guarded = Guarded(stop=COMMA_STOP)
-    assert guarded.check(b"ap12.50,bn08.75,cp15.00,dn10.25,\r\n") == ""
-    for data in (line(1.0), b"ap12.50,bn08.75,cp15.00,dn10.25;\r\n", seal(line(1.0), 7)):
-        assert guarded.check(data) == DAMAGED
 
 
 def test_a_question_passes_in_every_state_and_changes_no_speed() -> None:

@@ -61,21 +61,6 @@ def test_a_held_key_drives_without_a_break_and_stops_soon_after_its_release(
     assert keys.wish(last + REPEAT_S) is None
 
 
-@each("pause", [0.15, 0.5])
-def test_taps_are_no_held_key(pause: float) -> None:
-    keys = pressed("i", 10.0)
-    keys.press("i", 10.0 + pause)
-    assert keys.wish(10.0 + pause + KEY_HOLD_S - 0.001) == Twist(0.5, 0.0)
-    assert keys.wish(10.0 + pause + KEY_HOLD_S) is None
-
-
-def test_another_key_changes_the_direction_immediately() -> None:
-    keys = pressed("i", 10.0)
-    keys.press("j", 10.1)
-    assert keys.wish(10.1) == Twist(0.0, 2.0)
-    assert keys.wish(10.0 + KEY_HOLD_S) == Twist(0.0, 2.0)
-
-
 @each("key", [" ", "k", "p", "\x1b", "\x1b[H", "I", "\n", "�", ""])
 def test_any_other_key_stops_immediately(key: str) -> None:
     for keys in (pressed("i", 10.0), Keyboard(0.5, 2.0)):  # at rest, too
@@ -90,13 +75,6 @@ def test_speed_keys_change_ten_percent_and_do_not_move(
     keys = pressed(key, 10.0)
     assert (keys.linear, keys.angular) == pytest.approx((0.5 * linear, 2.0 * angular))
     assert keys.wish(10.0) is None
-
-
-def test_a_speed_key_while_driving_acts_immediately_and_does_not_extend_the_hold() -> None:
-    keys = pressed("u", 10.0)
-    keys.press("w", 10.5)
-    assert keys.wish(10.5) == Twist(0.5 * 1.1, 2.0)
-    assert keys.wish(10.0 + KEY_HOLD_S) is None
 
 
 @each(

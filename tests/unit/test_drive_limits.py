@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from itertools import pairwise
 
 import pytest
 from hypothesis import given, settings
@@ -172,17 +173,6 @@ def test_each_axis_changes_by_no_more_than_its_limit_and_no_wheel_is_too_fast(
 
 
 @law
-@given(wishes=st.lists(st.tuples(mixed, periods), max_size=40), most=st.floats(0.1, 40.0))
-def test_no_wheel_is_too_fast_if_the_robot_brakes_more_slowly_than_it_turns(
-    wishes: list[tuple[Twist, float]], most: float
-) -> None:
-    ramp = Ramp(LimitsConfig(wheel_speed=most, linear_deceleration=0.1))
-    for wish, dt in wishes:
-        ramp.follow(wish, dt)
-        assert ramp.fastest <= most * (1 + EPS)
-
-
-@law
 @given(wish=twists, start=twists, dt=periods)
 def test_a_goal_within_the_limits_is_reached_exactly_and_held(
     wish: Twist, start: Twist, dt: float
@@ -229,32 +219,6 @@ def test_at_the_wheel_limit_one_axis_waits_for_the_other(sign: float) -> None:
     assert both.fastest == pytest.approx(30.0)
 
 
-def test_a_small_wheel_at_its_limit_turns_the_robot_until_it_has_slowed_down() -> None:
-    # Without the turn the right wheel would be too fast, so the turn falls only as fast as the
-    # speed allows.
-    ramp = Ramp(TALL, DriveConfig(right_wheel_radius_multiplier=0.9))
-    start = ramp.follow(Twist(-1.0, 0.2), 1000.0)
-    assert ramp.fastest == pytest.approx(20.0)
-    after = ramp.follow(Twist(-0.8, 0.0))
-    assert abs(start.linear) - abs(after.linear) == pytest.approx(0.004)
-    assert ramp.fastest == pytest.approx(20.0)
-    assert 0.0 < after.angular < start.angular
-
-
-@each(
-    ("wheel_speed", "start", "goal", "dt"),
-    [(1.0, Twist(0.0225, 0.1833333), REST, 0.02), (0.5, REST, Twist(0.0135, 0.075), 0.01)],
-)
-def test_a_very_small_wheel_at_its_limit_never_stops_the_way_to_the_goal(
-    wheel_speed: float, start: Twist, goal: Twist, dt: float
-) -> None:
-    drive = DriveConfig(left_wheel_radius_multiplier=0.1)
-    ramp = Ramp(LimitsConfig(wheel_speed=wheel_speed), drive)
-    for step in range(1, 21):
-        ramp.follow(Twist(start.linear * step / 20, start.angular * step / 20), dt)
-    assert pair(ramp.path(goal, 1000, dt)[-1]) == near(*pair(goal))
-
-
 @each("sign", [1.0, -1.0])
 @each(
     ("ramp", "wish", "path"),
@@ -276,16 +240,6 @@ def test_paths_worked_by_hand(ramp: type, wish: float, path: list[float], sign: 
     if sign < 0:
         way.motion = replace(way.motion, twist=Twist(-way.twist.linear))
     assert [sign * speed for speed in way.speeds(sign * wish, len(path))] == pytest.approx(path)
-
-
-def test_the_two_axes_have_their_own_limits_and_pass_zero_when_they_reverse() -> None:
-    assert pair(Ramp(UNEVEN).follow(Twist(2.0, 4.0), 0.1)) == near(0.05, 0.1)
-    assert pair(moving(2.0, 4.0, UNEVEN).follow(REST, 0.1)) == near(1.8, 3.4)
-    for limits in (FREE, UNEVEN, JERKY):
-        path = moving(0.505, 2.0, limits).path(Twist(-0.5, -2.0), 800)
-        assert path[-1] == Twist(-0.5, -2.0)
-        assert min(abs(twist.linear) for twist in path) < EPS
-        assert min(abs(twist.angular) for twist in path) < EPS
 
 
 # coasting
@@ -340,3 +294,66 @@ def test_the_speed_never_exceeds_both_the_limit_and_the_cap_but_on_the_way_down(
         for _ in range(5):
             slower = abs(ramp.twist.linear) - ramp.limits.linear_deceleration * DT
             assert abs(ramp.follow(Twist(wish)).linear) <= max(min(cap, setting), slower) + EPS
+
+
+# jerk
+
+
+def test_jerk_takes_the_time_worked_by_hand_and_never_delays_braking() -> None:
+    # The slope rises to 1 m/s2 in 20 steps of 0.05 m/s2, which covers 0.105 m/s. It falls in 19
+    # steps, which covers 0.095 m/s. The 0.3 m/s in between take 30 steps of 10 ms.
+    *_, before, last = Ramp(JERKY).speeds(0.5, 69)
+    assert before < 0.5 == last
+    ramp = Ramp(JERKY)
+    fast = ramp.speeds(1.0, 30)[-1]
+    assert ramp.follow(REST).linear == pytest.approx(fast - 0.01)
+    assert moving(0.5, 0.0, JERKY).coast().linear == pytest.approx(0.49)
+
+
+def rising(speeds: list[float]) -> list[Pair]:
+    """Return, for each step that speeds up, its slope and the slope of the next step."""
+    return [
+        ((b - a) / DT, (c - b) / DT)
+        for (a, b), (_, c) in pairwise(pairwise([speeds[0], *speeds]))
+        if abs(c) > abs(b)
+    ]
+
+
+@law
+@given(wishes=st.lists(st.tuples(mixed, st.integers(1, 40)), max_size=8))
+def test_jerk_bounds_how_much_steeper_a_slope_gets_whatever_is_commanded(
+    wishes: list[tuple[Twist, int]],
+) -> None:
+    ramp, path = Ramp(JERKY), [REST]
+    for wish, steps in wishes:
+        path += ramp.path(wish, steps)
+    for step, speeds in ((0.05, [t.linear for t in path]), (0.2, [t.angular for t in path])):
+        for before, after in rising(speeds):
+            slope = abs(before) if before * after > 0.0 else 0.0
+            assert abs(after) <= slope + step + EPS
+
+
+@law
+@given(goals=st.lists(st.tuples(millimetres, st.integers(1, 40)), max_size=8))
+def test_jerk_bounds_how_fast_a_slope_levels_out_short_of_the_goal(
+    goals: list[tuple[float, int]],
+) -> None:
+    ramp, speed, slope = Ramp(JERKY), 0.0, 0.0
+    for goal, steps in goals:
+        for now in ramp.speeds(goal, steps):
+            before, slope, speed = slope, (now - speed) / DT, now
+            if speed not in (goal, 0.0) and slope * before > 0.0 and slope * speed > 0.0:
+                assert abs(slope) >= abs(before) - 0.05 - EPS
+
+
+@law
+@given(start=millimetres, goal=millimetres, dt=st.floats(0.005, 0.05), jerk=st.floats(2.0, 500.0))
+def test_with_jerk_the_goal_is_approached_from_one_side_reached_and_never_overshot(
+    start: float, goal: float, dt: float, jerk: float
+) -> None:
+    ramp = moving(start, 0.0, LimitsConfig(linear_jerk=jerk, wheel_speed=99.99))
+    path = [twist.linear for twist in ramp.path(Twist(goal, 0.0), int(6.0 / dt), dt)]
+    assert path[-1] == pytest.approx(goal, abs=EPS)
+    for before, after in pairwise([start, *path]):
+        assert (after - before) * (goal - start) >= -EPS
+        assert min(start, goal) - EPS <= after <= max(start, goal) + EPS

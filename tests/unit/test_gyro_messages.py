@@ -107,6 +107,13 @@ def test_a_refused_sample_is_counted_and_reported_with_its_reason(reason: str) -
     assert (event.name, event.kind, event.level) == ("imu_refused", reason, "warning")
 
 
+def test_a_negative_variance_is_refused() -> None:
+    with pytest.raises(DecodeError, match="the turn rate is below zero: -1"):
+        reading(
+            imu_message(angular_velocity={"z": 0.1}, angular_velocity_covariance=[0.0] * 8 + [-1.0])
+        )
+
+
 S = SILENCE_TIMEOUT_NS
 STORIES = [
     [(0, "one", "used"), (S // 2, "other", "refused"), (S - 1, "one", "used"),
@@ -131,25 +138,6 @@ def test_the_first_of_two_gyros_is_followed_until_it_is_silent(
         assert found is None or found.anew == (expected == "anew")
     refused = sum(expected == "refused" for *_, expected in story)
     assert counters["imu_second_sender"] == refused
-
-
-def test_two_frames_of_senders_without_a_name_are_two_gyros() -> None:
-    gyro, counters, events = GyroFollower(), Counter[str](), list[Event]()
-    used = [
-        gyro.receive(
-            imu_message(at_ns, "", header={"frame_id": frame}, angular_velocity={"z": 0.1}),
-            counters,
-            events,
-        )
-        is not None
-        for at_ns, frame in enumerate(("imu_link", "lidar_imu", "imu_link"))
-    ]
-    assert used == [True, False, True]
-    assert counters == {"imu_second_sender": 1}
-    assert events[0].text == (
-        "a sender without a name (frame lidar_imu) sends gyro samples, but the daemon already uses "
-        "those of a sender without a name (frame imu_link): end one of the two programs"
-    )
 
 
 def test_a_robot_with_its_own_gyro_never_follows_another_one() -> None:

@@ -9,7 +9,7 @@ from acsard.core.codes import Reason, joined, reason
 from acsard.core.config.settings import Place, SafetyConfig
 from acsard.core.link.board_status import BoardStatus
 from acsard.core.motion import bumpers as bumpers_module
-from acsard.core.motion.bumpers import DIRECTIONS, Bumpers, pressed_words
+from acsard.core.motion.bumpers import Bumpers, pressed_words
 from acsard.core.motion.emergency_stop import PRESSED_REASON, TRANSITIONS, EmergencyStop, Sign
 from acsard.core.values import REST, EstopState, Twist
 from tests.each import each
@@ -160,18 +160,6 @@ def test_a_new_board_must_report_a_required_button_itself(before: str) -> None:
     assert not pin.missing
 
 
-def test_a_button_is_forgotten_unless_the_new_board_reports_it() -> None:
-    pin = button()
-    pin.step("!")
-    pin.part.reopen()
-    pin.step("!")
-    pin.part.forget()
-    assert pin.step() == "pressed"
-    pin.part.reopen()
-    pin.part.forget()
-    assert (pin.quiet(2000), pin.part.pressed) == ("", None)
-
-
 # bumpers
 
 FOUR: tuple[Place, ...] = ("front", "rear", "left", "right")
@@ -202,15 +190,6 @@ def test_each_place_allows_only_the_straight_motion_that_leads_away(marks: str, 
             assert allowed == Twist(sign * min(0.1, abs(twist.linear)), 0.0)
 
 
-def test_two_bumpers_at_one_place_allow_the_same_motion_as_one() -> None:
-    assert set(DIRECTIONS) == set(get_args(Place))
-    pin = bumpers("front", "front", "rear", bumper="away")
-    assert isinstance(pin.part, Bumpers)
-    for marks in ("X..", ".X.", "XX."):
-        pin.step(marks)
-        assert pin.part.away(Twist(-0.5, 1.0), pin.safety) == Twist(-0.1, 0.0)
-
-
 def test_each_new_bumper_is_a_press_but_the_release_of_one_is_not() -> None:
     pin = bumpers("front", "rear")
     for marks, press, why in (
@@ -225,21 +204,6 @@ def test_each_new_bumper_is_a_press_but_the_release_of_one_is_not() -> None:
     assert pin.part.pressed_now == pressed("front and rear bumpers")
     assert pressed_words(FOUR, (True, False, True, False)) == "front and left bumpers pressed"
     assert pressed_words((), (True, False, True)) == "bumpers 1 and 3 pressed"
-
-
-def test_a_release_says_that_a_stop_stays_only_if_there_is_one() -> None:
-    texts = []
-    for bumper, quiet in (("away", False), ("away", True), ("stop", False)):
-        pin = bumpers("front", "rear", bumper=bumper)
-        pin.step("..")
-        pin.step("X.")
-        if quiet:
-            pin.quiet(600)
-        pin.now_ms += 10
-        report = [(pin.now_ms * MS, BoardStatus(bumpers=(False, False)))]
-        (event,) = pin.part.process_reports(report, pin.now_ms * MS, pin.safety)
-        texts.append("stays" in event.text or "lasts" in event.text)
-    assert texts == [False, True, True]
 
 
 def test_bumpers_with_places_are_missing_until_the_board_reports_their_number() -> None:

@@ -6,42 +6,13 @@ import pytest
 
 from acsard.core.config.settings import Config, McuConfig, SafetyConfig
 from acsard.core.motion.latches import after_restart
-from acsard.core.values import REST, STILL, Twist, WheelSpeeds
+from acsard.core.values import REST, Twist, WheelSpeeds
 from tests.each import each
-from tests.unit.rig import GO, ROLLING, ZERO_LINE, Rig, names
+from tests.unit.rig import GO, ROLLING, ZERO_LINE, Rig
 
 # the emergency stop
 
 OK, PRESSED = b"!status estop=ok\r\n", b"!status estop=pressed\r\n"
-
-
-def test_a_press_sends_zero_and_latches_in_the_same_step_until_a_clear_and_a_zero() -> None:
-    rig = Rig(status=OK).driving()
-    out = rig.board(PRESSED).step(GO)
-    assert (out.mode, out.line, out.speeds, out.code) == (
-        "stopped", ZERO_LINE, STILL, "emergency_stop",
-    )  # fmt: skip
-    assert {"emergency_stop", "mode"} <= set(names(out))
-    assert rig.counters["emergency_stops"] == 1
-    assert rig.snapshot.estop == "pressed"
-    assert rig.snapshot.board == {"emergency_stop": "pressed", "age_s": "0.0"}
-    # A line that was not sent is repeated as zero.
-    assert {out.line for out in rig.each(3, GO, superseded=True)} == {ZERO_LINE}
-    assert not rig.answer("clear").success
-    rig.board(OK).step(GO)
-    assert rig.mode == "stopped"
-    assert rig.answer("clear").success
-    assert rig.drives()
-
-
-def test_a_press_between_two_ticks_is_zero_at_once_whether_or_not_a_line_may_leave() -> None:
-    for at_once in (True, False):
-        rig = Rig(status=OK).driving()
-        rig.board(PRESSED)
-        out = rig.step(GO, tick=False, at_once=at_once)
-        line = ZERO_LINE if at_once else None
-        assert (out.mode, out.line, out.speeds) == ("stopped", line, STILL)
-        assert rig.step(GO).line == ZERO_LINE
 
 
 def test_a_press_that_was_released_in_the_same_read_stays_a_stop() -> None:
@@ -104,21 +75,6 @@ AWAY = Config(safety=SafetyConfig(bumpers=("front", "rear"), bumper="away"))
 BACK = Twist(-0.5, 0.4)
 
 
-def test_a_bumper_stops_the_robot_at_once_until_a_clear_after_the_release() -> None:
-    rig = Rig(status=FREE).driving()
-    out = rig.board(FRONT).step(GO)
-    assert (out.mode, out.line, out.code) == ("stopped", ZERO_LINE, "bumper")
-    assert {"bumper_pressed", "mode"} <= set(names(out))
-    assert rig.counters["bumper_presses"] == 1
-    assert rig.snapshot.bumpers == (True, False)
-    assert rig.snapshot.bumper is not None
-    assert rig.snapshot.bumper.code == "bumper"
-    assert not rig.answer("clear").success
-    assert rig.board(FREE).step(GO).mode == "stopped"
-    assert rig.answer("clear").success
-    assert rig.drives()
-
-
 def test_a_bumper_that_limits_stops_once_and_then_allows_the_retreat() -> None:
     for status in (FRONT, FRONT + FREE):
         rig = Rig(AWAY, status=FREE).driving()
@@ -148,40 +104,9 @@ def test_a_command_against_a_pressed_bumper_makes_its_sender_unarmed(wrong: Twis
     assert rig.board(FREE).drives()
 
 
-def test_a_bumper_in_the_direction_of_the_retreat_ends_it() -> None:
-    rig = Rig(AWAY, status=FRONT)
-    rig.linked().step(REST)
-    rig.run(20, BACK)
-    out = rig.board(BOTH).step(BACK)
-    assert (out.mode, out.line) == ("ready", ZERO_LINE)
-    assert {rig.step(twist).line for twist in (REST, BACK, REST, GO)} == {ZERO_LINE}
-    assert rig.board(REAR).step(REST).mode == "driving"
-    assert rig.run(2, GO).applied.linear > 0.0
-
-
-def test_silent_bumpers_latch_a_stop_also_if_a_press_would_only_limit() -> None:
-    rig = Rig(AWAY, status=FREE).driving()
-    out = rig.board(b"").run(51, GO)
-    assert (out.mode, out.code) == ("stopped", "bumpers_silent")
-    assert rig.snapshot.bumpers == (True, True)
-
-
 # the motor drivers
 
 DRIVER_OK, FAULT = b"!status driver=ok\r\n", b"!status driver=fault\r\n"
-
-
-def test_a_drivers_fault_is_latched_until_a_clear_after_its_end() -> None:
-    rig = Rig(status=DRIVER_OK).driving()
-    out = rig.board(FAULT).step(GO)
-    assert (out.mode, out.code) == ("fault", "driver_fault")
-    assert not rig.answer("clear").success
-    assert rig.board(DRIVER_OK).step(GO).mode == "fault"
-    # Nor does a clear in the step in which it comes again.
-    assert not rig.board(FAULT + DRIVER_OK).answer("clear").success
-    assert rig.mode == "fault"
-    assert rig.board(DRIVER_OK).answer("clear").success
-    assert rig.step(GO).mode == "ready"
 
 
 @each(
@@ -244,16 +169,6 @@ def test_a_driver_fault_while_nobody_knows_of_a_press_does_not_count_and_then_do
     assert ignored.linked().mode == "fault"
 
 
-def test_after_a_clear_of_only_the_fault_drivers_may_still_lack_power() -> None:
-    rig = Rig(status=OK + DRIVER_OK).linked()
-    rig.board(PRESSED).step()
-    assert rig.board(OK + DRIVER_OK).step(guard_trip="guard_line_damaged").mode == "fault"
-    rig.step()
-    assert rig.answer("clear").success
-    assert rig.mode == "stopped"
-    assert rig.board(OK + FAULT).step().mode == "stopped"
-
-
 # another board, or a restart
 
 
@@ -278,35 +193,6 @@ def test_a_board_that_reports_no_inputs_does_not_inherit_those_of_the_previous_o
     assert rig.drives()
 
 
-@each("late", [[(0, 5000)], [(120, 90)] * 3])
-def test_late_steps_do_not_shorten_the_time_for_the_reports_of_a_new_board(
-    late: list[tuple[int, int]],
-) -> None:
-    rig = replugged(Rig(status=FAULT).linked(), b"")
-    for steps, ms in late:
-        assert not rig.answer("clear").success
-        rig.each(steps)
-        rig.step(ms=ms)
-    if len(late) == 1:
-        assert not rig.answer("clear").success
-        rig.run(310)
-    assert rig.answer("clear").success
-
-
-@each("new", [replugged, lambda rig, _: rig.board(b"!acsard-mcu 1\r\n")])
-def test_a_board_that_has_reported_a_press_must_report_the_release(new: type) -> None:
-    rig = Rig(status=PRESSED).linked()
-    new(rig, b"")
-    rig.step()
-    rig.board(b"")
-    assert not any(rig.answer("clear").success for _ in range(100))
-    if new is replugged:
-        rig.board(PRESSED)
-    assert not any(rig.answer("clear").success for _ in range(500))
-    rig.board(OK).step()
-    assert rig.answer("clear").success
-
-
 def test_each_board_must_report_the_required_inputs_before_the_robot_is_ready() -> None:
     rig = Rig(Config(safety=SafetyConfig(estop="required"))).linked()
     assert (rig.mode, rig.board(OK).step().mode) == ("waiting", "ready")
@@ -328,12 +214,6 @@ def test_each_board_must_report_the_required_inputs_before_the_robot_is_ready() 
     assert modes == {"waiting", "stopped"}
     assert (rig.answer("clear").success, rig.mode) == (True, "waiting")
     assert rig.board(one).step().mode == "ready"
-
-
-def test_a_restarted_daemon_allows_clear_after_3_s_without_a_report() -> None:
-    rig = Rig(latches=after_restart(Rig(status=PRESSED).linked().out.latches)).linked()
-    allowed = [rig.answer("clear").success for _ in range(320)]
-    assert 290 < allowed.index(True) < 310
 
 
 @pytest.mark.parametrize("line", [PRESSED, OK + FAULT, REAR])

@@ -9,14 +9,11 @@ from contextlib import suppress
 
 import pytest
 
-from acsard.core.config.settings import Place, SafetyConfig, WheelMap
+from acsard.core.config.settings import WheelMap
 from acsard.core.link.board_status import STATUS, BoardStatus, as_text, decode_status, merged
 from acsard.core.link.checked_line import unseal
 from acsard.core.link.codec import Codec, FrameError
-from acsard.core.motion.bumpers import Bumpers
-from acsard.core.motion.emergency_stop import SILENCE_TIMEOUT_S, EmergencyStop
 from acsard.core.simulator import protocol
-from acsard.core.values import NS_PER_S
 from tests.each import each
 
 FULL = b"!status estop=ok bumpers=..X. driver=fault volts=24.31 amps=-1.20 charge=87% temp=-4.5"
@@ -45,23 +42,6 @@ def test_each_field_is_read(check: bool) -> None:
         estop=False, bumpers=(False, False, True, False), driver_fault=True, volts=24.31,
         amps=-1.2, charge=0.87, temperature=-4.5,
     )  # fmt: skip
-
-
-@each(
-    ("fields", "status"),
-    [
-        (b"estop=pressed", BoardStatus(estop=True)),
-        (b"volts=7.05 estop=ok", BoardStatus(estop=False, volts=7.05)),
-        (b"bumpers=X", BoardStatus(bumpers=(True,))),
-        (b"driver=ok", BoardStatus(driver_fault=False)),
-        (b"charge=0%", BoardStatus(charge=0.0)),
-        (b"charge=100%", BoardStatus(charge=1.0)),
-        (b"amps=120.00", BoardStatus(amps=120.0)),
-        (b"temp=101.5", BoardStatus(temperature=101.5)),
-    ],
-)
-def test_each_field_is_optional_and_the_order_is_free(fields: bytes, status: BoardStatus) -> None:
-    assert decode_status(STATUS + b" " + fields, False) == status
 
 
 @each(
@@ -178,50 +158,3 @@ def test_damage_never_changes_the_emergency_stop(count: int, check: bool) -> Non
                 tally["right" if read in (None, word == PRESSED) else "wrong"] += 1
     assert check or tally["right"] > count / 100
     assert tally["wrong"] == 0
-
-
-@each("check", [False, True])
-@pytest.mark.parametrize("count", COUNTS)
-@pytest.mark.parametrize("places", [("front", "rear", "left", "right"), ()])
-def test_damage_never_changes_the_state_of_a_bumper(
-    places: tuple[Place, ...], count: int, check: bool
-) -> None:
-    dice, extra = random.Random(34), (b"", b" volts=24.31", b" driver=ok temp=41.5")
-    # A release stays until the next line that counts, so each damaged line has bumpers of its own.
-    for number in range(count // 4):
-        safety = SafetyConfig(bumpers=places)
-        bumpers, marks = Bumpers(), bytearray(b"....")
-        for pressed in dice.sample(range(4), dice.randint(0, 4)):
-            marks[pressed] = b"X"[0]
-        state = "pressed" if b"X" in marks else "released"
-        line = STATUS + b" bumpers=" + marks + dice.choice(extra)
-        line = sealed(line) if check else line
-        whole = [(number, decode_status.__wrapped__(line, check))]
-        # Without places the number of the bumpers counts from the second line on.
-        bumpers.process_reports(whole * 2, number, safety)
-        for _ in range(4):
-            frame = damaged(line, (line, *REPLIES), dice)
-            if frame.startswith(STATUS):
-                with suppress(FrameError):
-                    status = decode_status.__wrapped__(frame, check)
-                    bumpers.process_reports([(number, status)], number, safety)
-            assert bumpers.state == state, (number, line, frame)
-            if not places:
-                # Without places only a single damaged line is known by its number of bumpers.
-                bumpers.process_reports(whole, number, safety)
-
-
-def test_a_false_press_needs_half_a_second_of_damage() -> None:
-    """The damage destroys about half of the status lines, of which ten come in a second."""
-    dice, estop = random.Random(5), EmergencyStop()
-    step_ns, presses, runs, last_ns = NS_PER_S // 100, 0, 0, 0
-    for step in range(40_000):
-        now_ns, reports = step * step_ns, []
-        if step % 10 == 0 and (step == 0 or dice.random() < 0.5):
-            reports = [(now_ns, decode_status(OK, False))]
-            last_ns = now_ns
-        estop.process_reports(reports, now_ns, SafetyConfig())
-        presses += bool(estop.pressed_now)
-        runs += now_ns - last_ns == int(SILENCE_TIMEOUT_S * NS_PER_S) + step_ns
-    assert presses == runs
-    assert 20 < presses < 200

@@ -168,12 +168,6 @@ def test_an_early_line_replaces_the_line_of_the_next_period() -> None:
     assert paced.ticks(20 * MS)
 
 
-def test_after_missed_periods_the_periodic_line_is_sent_even_after_an_early_one() -> None:
-    paced = ticked()
-    assert paced.hears(6 * MS)
-    assert paced.ticks(50 * MS, missed=4)
-
-
 def test_a_failed_early_line_does_not_replace_the_periodic_line() -> None:
     paced = ticked()
     assert paced.hears(6 * MS, goes=False)
@@ -202,14 +196,6 @@ def test_messages_without_effect_wake_the_loop_a_limited_number_of_times_a_perio
     assert not paced.pace.early
     paced.ticks(10 * MS)
     assert paced.pace.early
-
-
-def test_no_early_line_is_scheduled_if_the_next_period_comes_within_the_gap() -> None:
-    paced = Paced(period_ns=GAP_NS)
-    paced.ticks(0)
-    assert not paced.pace.early
-    assert not paced.hears(GAP_NS)
-    assert paced.retry_ns is None
 
 
 @given(st.lists(st.tuples(st.integers(1, 12), st.booleans(), st.booleans()), max_size=200))

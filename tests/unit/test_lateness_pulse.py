@@ -123,18 +123,6 @@ async def test_a_command_during_a_step_that_expects_early_ones_runs_another_step
     assert len(steps.all) == 2
 
 
-async def test_a_flood_of_commands_runs_one_step_until_the_next_is_expected() -> None:
-    steps = Steps()
-    async with steps.running(0.1):
-        steps.pace.early = True
-        steps.wake()
-        steps.pace.early = False
-        for _ in range(100):
-            steps.pulse.command()
-            await asyncio.sleep(0)
-    assert len(steps.all) == 2
-
-
 async def test_in_a_flood_of_stops_one_step_is_early_and_the_period_takes_the_rest() -> None:
     steps = Steps()
     async with steps.running(0.1):

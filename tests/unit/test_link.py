@@ -10,9 +10,9 @@ from acsard.core.config.settings import FeedbackConfig, McuConfig
 from acsard.core.config.wire_time import wire_ns
 from acsard.core.link.feedback import MIN_INTERVAL_NS
 from acsard.core.link.link_setup import LinkSetup
-from acsard.core.link.link_state import BAD_LINES, GOOD_LINES, Input, Link, State
+from acsard.core.link.link_state import BAD_LINES, GOOD_LINES, Link
 from acsard.core.link.session import LONG_GAP_NS, McuSession
-from acsard.core.values import NS_PER_S, STILL, Instant, Received, WheelSpeeds
+from acsard.core.values import NS_PER_S, Instant, Received, WheelSpeeds
 from tests.each import each
 from tests.unit.link_bench import (
     BAD,
@@ -136,18 +136,6 @@ class States:
         return self.link.state
 
 
-@each(
-    ("sign", "state"),
-    [("closed", "down"), ("opened", "booting"), ("restarted", "booting"), ("damaged", "stale")],
-)
-def test_after_the_link_ends_good_lines_are_counted_from_zero(sign: Input, state: State) -> None:
-    states = States()
-    assert states.good(GOOD_LINES + 1, may_rise=False) == "booting"
-    assert states.good() == "up"
-    states.link.apply(sign)
-    assert states.link.state == states.good(GOOD_LINES - 1) == state
-
-
 @each(("checked", "state"), [(False, "up"), (True, "stale")])
 def test_bad_lines_alone_take_only_a_checked_link_down_but_are_reported(
     checked: bool, state: str
@@ -213,18 +201,6 @@ def test_the_time_and_the_gap_of_a_line(
 
 
 # counting, and the configuration
-
-
-def test_good_lines_are_counted_and_bad_ones_by_reason_over_all_sessions() -> None:
-    bench = LinkBench().up()
-    bench.wait(10, BAD + GOOD + b"x" * 200 + b"\n" + b"x\r\n")
-    bench.wait(10, b"ap99.999,bp00.00,cp00.00,dp00.00\n" + b"\x00" * 300)
-    bench.close().wait(10)
-    bench.open().wait(10, b"\n" + b"ap01.00,ap00.00,cp00.00,dp00.00\n" * 3 + GOOD)
-    assert bench.session.good_lines == GOOD_LINES + 3
-    assert bench.session.rejects == {
-        "malformed": 2, "too_long": 2, "over_range": 1, "duplicate_wheel": 3,
-    }  # fmt: skip
 
 
 @each("reads", [1, 4])
@@ -318,12 +294,3 @@ def test_a_board_that_repeats_commands_but_not_the_question_has_no_encoders(enco
             break
     assert bench.link == ("stale" if encoders else "up")
     assert not encoders or (bench.why.code == "set_points" and 150 < n < 300)
-
-
-def test_the_question_never_takes_the_place_of_the_line_that_stops_the_wheels() -> None:
-    bench = LinkBench().up()
-    bench.echoed(1.0, 46)
-    assert bench.session._echo.due
-    assert bench.line(STILL) == STOP
-    bench.wait(10, GOOD)
-    assert bench.line(STILL) == b"?\r\n"

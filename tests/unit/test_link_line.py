@@ -268,12 +268,3 @@ def test_after_an_over_long_line_the_next_newline_resynchronises(length: int) ->
     assert reader.too_long == 1
     assert feed(reader, b"x" * 127 + b"\n", b"x" * 126 + b"\r\n") == [b"x" * 127, b"x" * 126]
     assert feed(reader, b"x" * 128 + b"\n", b"x" * 127 + b"\r\n") == []
-
-
-@each("before", [SEED_LINE[:10], b"x" * 500])
-def test_clear_forgets_half_a_line_and_ends_the_discarding(before: bytes) -> None:
-    reader = LineReader()
-    reader.feed(before)
-    reader.clear()
-    assert feed(reader, SEED_LINE + b"\n") == [SEED_LINE]
-    assert reader.too_long == (len(before) > 128)

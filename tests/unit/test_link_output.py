@@ -10,7 +10,6 @@ from msgspec.structs import replace
 from acsard.core.config.settings import McuConfig, WheelMap
 from acsard.core.config.wire_time import wire_ns
 from acsard.core.link.checked_line import SAMPLE_REQUEST, seal
-from acsard.core.link.link_state import GOOD_LINES
 from acsard.core.link.serial_output import SerialOutput
 from acsard.core.values import STILL, WheelSpeeds
 from tests.each import each
@@ -93,15 +92,6 @@ def test_a_stop_of_any_form_is_never_too_old(stop: bytes, letters: bytes | None)
     wire = Wire(stop=stop).started()
     assert wire.offer(line, 1000, made_ms=100) == "sent"
     assert wire.out == line
-
-
-@each(("takes", "prefix"), [(33, b""), (32, b"\r\n"), (0, b"")])
-def test_a_line_begins_with_a_line_end_only_after_a_torn_line(takes: int, prefix: bytes) -> None:
-    wire = Wire().started()
-    assert wire.offer(GO, 10, takes=takes) == ("sent" if takes == 33 else "superseded")
-    wire.out = b""
-    assert wire.offer(GO, 20) == "sent"
-    assert wire.out == prefix + GO
 
 
 @settings(max_examples=100)
@@ -207,20 +197,6 @@ def test_an_output_that_is_blocked_for_the_watchdog_time_makes_the_link_stale() 
     late.line()
     late.update(True, 10, GOOD)
     assert not late.session.blocked
-
-
-@each(("ms", "restarted"), [(900, False), (1010, True)])
-def test_a_sent_line_ends_the_block_and_a_block_of_a_second_restarts_the_session(
-    ms: float, restarted: bool
-) -> None:
-    bench = blocked(ms)
-    bench.line()
-    bench.update(True, 10, GOOD)
-    assert (bench.session.blocked, bench.session.restarted) == (False, restarted)
-    for _ in range(GOOD_LINES):
-        bench.line()
-        bench.update(True, 10, GOOD)
-    assert bench.link == "up"
 
 
 # when rest was commanded

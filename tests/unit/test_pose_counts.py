@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from acsard.core.link.codec import Motors
 from acsard.core.link.feedback import Feedback
-from acsard.core.link.quantization import BLOCK_STEPS, FIRST_STEPS, CountRecovery, Steps
+from acsard.core.link.quantization import BLOCK_STEPS, CountRecovery, Steps
 from acsard.core.link.whole_counts import MAX_DOUBT
 from acsard.core.link.whole_counts import WholeCounts as Recovered
 from acsard.core.values import Instant, WheelSpeeds
@@ -107,14 +107,6 @@ def fine_speeds(count: int = 2 * BLOCK_STEPS) -> list[float]:
     return [round(10 + dice.uniform(-0.2, 0.2) + 0.02 * i, 2) for i in range(count)]
 
 
-def test_the_quantization_step_is_unknown_until_enough_steps_were_seen() -> None:
-    speeds = [0.1 * (i % 2) for i in range(FIRST_STEPS)]
-    steps = steps_after(speeds)
-    assert steps.size == math.inf
-    steps.add(0.2)
-    assert steps.size < 0.3
-
-
 def test_one_damaged_line_does_not_change_the_quantization_step() -> None:
     steps = steps_after(fine_speeds(2 * BLOCK_STEPS + 8))
     steps_after([40.0, 12.0], steps)
@@ -175,10 +167,6 @@ def missed(counts: int, jitter: float, nominal: bool = False) -> Array:
 @pytest.mark.parametrize("nominal", [False, True])
 def test_a_jitter_of_two_ms_loses_no_count(counts: int, nominal: bool) -> None:
     assert missed(counts, 0.002, nominal).max() < 0.01
-
-
-def test_a_fine_encoder_loses_few_counts() -> None:
-    assert missed(400, 0.0005).max() < 3.0
 
 
 def test_a_line_that_repeats_the_previous_one_turns_no_wheel() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from time import process_time
 from typing import Any, Literal
 
 import pytest
@@ -222,3 +223,15 @@ def test_late_reads_neither_add_nor_lose_time() -> None:
         total += bench.line(ms=10 + late).dt
         bench.now_ns -= late * MS
     assert total == pytest.approx((bench.now_ns - began) / 1e9, abs=0.004)
+
+
+def test_a_free_running_board_that_was_silent_for_a_day_costs_no_period() -> None:
+    bench = Bench(counts=0, period=0.01)
+    for _ in range(100):
+        bench.line()
+    begin = process_time()
+    line = bench.line(ms=86_400_000.0, gap=True)
+    assert process_time() - begin < 0.02
+    assert line.gap == pytest.approx(86_400.0, abs=0.02)
+    for _ in range(100):
+        assert bench.line().dt == pytest.approx(0.01)

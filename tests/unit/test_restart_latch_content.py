@@ -16,7 +16,6 @@ from acsard.core.motion.lifecycle import Lifecycle
 from acsard.core.values import Cause, CauseKind, Latches
 from acsard.daemon.latch_file import (
     FORMAT,
-    MAX_BYTES,
     MAX_NUMBER,
     LatchFileError,
     decode,
@@ -25,7 +24,7 @@ from acsard.daemon.latch_file import (
     unreadable,
 )
 from tests.each import each
-from tests.unit.test_restart_latch_file import ALL, JOE, NOW, RUNAWAY, STOP, kept
+from tests.unit.test_restart_latch_file import ALL, NOW, RUNAWAY, STOP, kept
 
 texts = st.text(st.characters(codec=None), max_size=600)
 cause = st.builds(
@@ -38,13 +37,6 @@ cause = st.builds(
     texts,
     st.integers(-(2**63) + 1, 2**63 - 1),
 )
-
-
-def test_the_file_is_json_that_a_person_can_read() -> None:
-    text = encode("acsar", STOP).decode()
-    assert len(text.splitlines()) > 10
-    assert '\n  "causes"' in text
-    assert text.endswith("\n}\n")
 
 
 def test_numbers_grow_over_restarts_and_a_killed_run_s_numbers_are_not_used_again() -> None:
@@ -70,11 +62,6 @@ def test_no_text_of_a_client_loses_a_cause(causes: list[Cause]) -> None:
     assert [one.number for one in after] == [one.number for one in causes]
 
 
-def test_the_names_and_texts_of_as_many_causes_as_there_can_be_fit_into_the_file() -> None:
-    causes = [replace(JOE, text="x" * 1000, by="j" * 1000)] * MAX_CAUSES
-    assert len(encode("acsar", Latches(tuple(causes), MAX_NUMBER))) < MAX_BYTES
-
-
 def test_half_a_file_is_refused_at_every_length() -> None:
     whole = encode("acsar", ALL)
     for length in range(len(whole) - 1):  # the last byte only ends the last line
@@ -93,20 +80,6 @@ def test_one_flipped_bit_never_makes_a_cause_disappear() -> None:
         except LatchFileError:
             continue
         assert [cause.kind for cause in after.causes] == ["stop", "fault", "inactive"]
-
-
-@given(st.binary(max_size=300))
-def test_garbage_is_refused(data: bytes) -> None:
-    with pytest.raises(LatchFileError):
-        decode("acsar", data)
-
-
-def test_fields_that_a_later_version_added_are_ignored() -> None:
-    raw = msgspec.json.decode(encode("acsar", ALL))
-    for one in raw["causes"]:
-        one["later"] = {"deep": [1]}
-    raw["later"] = 1
-    assert decode("acsar", msgspec.json.encode(raw)).causes == kept(ALL)
 
 
 @each("index", [0, 1, 2])

@@ -18,7 +18,6 @@ from acsard.core.motion.latches import (
     describe,
     in_force,
     latched,
-    released,
     stopped,
 )
 from acsard.core.motion.lifecycle import SHOWN_S, Lifecycle
@@ -48,17 +47,6 @@ def at(seconds: float) -> Instant:
 
 def numbers(latches: Latches) -> list[int]:
     return [cause.number for cause in latches.causes]
-
-
-def test_each_cause_has_a_new_number_and_a_release_takes_what_it_names() -> None:
-    latches = stopped(Latches(last=41), "joe", WALL_NS)
-    latches = latched(latches, "fault", dead("front_left"), WALL_NS)
-    latches = stopped(latches, "ann", WALL_NS)
-    assert numbers(latches) == [42, 43, 44]
-    assert numbers(released(latches, [43, 7])) == [42, 44]
-    latches = released(latches, {42, 43, 44})
-    assert latches == Latches((), 44)
-    assert numbers(stopped(latches, "joe", WALL_NS)) == [45]
 
 
 def test_the_same_cause_renews_its_number_and_is_there_once() -> None:
@@ -235,21 +223,6 @@ def test_the_two_seconds_count_from_the_end_of_the_step_that_latched() -> None:
         with pytest.raises(RefusedError):
             life.clear(None, ns(asked_s))
     assert life.clear(None, ns(6.0))[1] == (1,)
-
-
-def test_nothing_is_released_while_its_cause_lasts() -> None:
-    timed = Timed()
-    fault, press = timed.fault(), timed.press()
-    timed.run(3.0)
-    for named in ((), (fault,), (press,), (fault, press)):
-        with pytest.raises(RefusedError, match="release it at the robot, then call srv/clear"):
-            timed.clear(*named)
-    asked_s = timed.now_s
-    timed.life.hold(None, ns(timed.now_s))
-    with pytest.raises(RefusedError, match="before the cause of the stop or fault had ended"):
-        timed.clear(press, asked_s=asked_s)
-    timed.run(0.01)
-    assert timed.clear(fault, press)
 
 
 def test_only_activate_ends_inactive_and_only_without_a_latched_stop() -> None:

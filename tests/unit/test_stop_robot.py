@@ -4,20 +4,14 @@ from __future__ import annotations
 
 import pytest
 
-from acsard.core.config.settings import Config
-from acsard.core.robot import Robot
 from acsard.core.values import (
-    NS_PER_S,
     REST,
-    Instant,
-    Received,
     Request,
     Verb,
     WheelSpeeds,
 )
 from tests.each import each
-from tests.stepped import Inputs, SteppedRobot
-from tests.unit.rig import GO, MS, ZERO_LINE, Rig
+from tests.unit.rig import GO, ZERO_LINE, Rig
 
 
 @each(
@@ -111,13 +105,6 @@ def test_a_third_impossible_line_is_a_fault_that_brakes_by_the_stop_deceleration
     assert [out.mode for out in rig.each(3)] == ["ready", "ready", "fault"]
 
 
-def test_a_lost_link_begins_to_count_impossible_lines_again() -> None:
-    rig = impossible(Rig().driving(), 2)
-    rig.unplug().step()
-    impossible(rig.replug(), 5)
-    assert (rig.out.link, rig.mode) == ("up", "ready")
-
-
 def test_impossible_speeds_of_any_wheel_are_one_cause_and_hide_no_later_cause() -> None:
     rig = impossible(Rig().driving(), 3)
     for wheel in range(4):
@@ -132,12 +119,6 @@ def test_impossible_speeds_of_any_wheel_are_one_cause_and_hide_no_later_cause() 
     assert (newest.code, second) == ("guard_too_fast", first)
 
 
-def test_the_distance_of_impossible_feedback_is_not_made_up_later() -> None:
-    rig = impossible(Rig().linked(), 100)
-    before = rig.snapshot.pose
-    assert rig.run(20).estimates[-1].pose == before
-
-
 # the end
 
 
@@ -148,14 +129,3 @@ def test_shutting_down_ramps_to_zero_by_the_stop_deceleration_and_stays_there() 
     assert path[:3] == pytest.approx([0.47, 0.44, 0.41])
     assert path[17:] == [0.0, 0.0, 0.0]
     assert (rig.mode, rig.out.code) == ("shutdown", "shutting_down")
-
-
-def test_a_flood_of_bytes_faster_than_the_wire_raises_no_error() -> None:
-    """Many reads have the same time, so the host cannot estimate the board's clock from them."""
-    robot = SteppedRobot(Robot(Config()))
-    good = b"a0.00,b0.00,c0.00,d0.00\r\n"
-    for n in range(600):
-        odd, after = n % 12 == 0, n % 12 == 1
-        data = (b"" if after else b"xxxxxxxxxx\n") + good + (b"" if odd else b"y" * 120)
-        now = Instant(1000 * NS_PER_S + n * MS, 0)
-        robot.step(Inputs(now, n % 10 == 0, True, 1, received=(Received(now, data),)))

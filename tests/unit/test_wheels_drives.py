@@ -120,7 +120,10 @@ def test_an_hour_of_clean_driving_raises_one_false_alarm_at_most(counts: int, se
 @pytest.mark.parametrize(
     ("counts", "speed", "within"),
     [
-        (3200, 20.0, 0.21), (3200, 4.0, 0.31), (400, 20.0, 0.31), (400, 4.0, 1.5),
+        (3200, 20.0, 0.21),
+        (3200, 4.0, 0.31),
+        (400, 20.0, 0.31),
+        (400, 4.0, 1.5),
     ],
 )
 def test_the_time_to_report_slip_of_a_tenth_depends_on_counts_and_speed(

@@ -19,7 +19,7 @@ from acsard.core.motion.arbiter_text import (
     waiting,
 )
 from acsard.core.motion.modes import Mode
-from acsard.core.values import NS_PER_S, REST, Command, Echo, Event, Refusal, SourceStatus, Wait
+from acsard.core.values import NS_PER_S, REST, Command, Echo, Event, Refusal, Wait
 from tests.each import each
 from tests.unit.commanders import GO, MS, SOURCES, Commanders
 
@@ -81,23 +81,6 @@ def test_stories(stories: dict[str, str], reverse: bool) -> None:
             raise
 
 
-@each("before", ["zero", "go"])
-def test_the_latest_reset_counts_and_what_arrived_before_it_arms_nobody(before: str) -> None:
-    one = Commanders()
-    one.arbiter.require_neutral(one.now_ns + 100 * MS)
-    one.arbiter.require_neutral(one.now_ns)
-    one.play(f"50 high.a {before}; 300 high.a go > -")
-
-
-def test_the_sources_are_listed_by_priority_with_the_age_of_their_last_accepted_command() -> None:
-    one = Commanders()
-    assert [s.priority for s in one.statuses()] == [100, 100, 50, 50, 10, 5]
-    assert one.status("high") == SourceStatus("high", 100, None, Wait("command"))
-    one.play("high.a zero; 50 high.b zero; 20 high.b nan ! not_finite")
-    assert one.status("high").age_s == 0.02
-    assert one.wait(-21).status("high").age_s == 0.0  # it arrived during the step
-
-
 def test_a_stall_of_the_daemon_changes_no_sender_and_brings_none_back() -> None:
     for other in ("left", "right"):
         one = Commanders().play("wake; left.a zero; 50 wake; left.a zero")
@@ -107,12 +90,6 @@ def test_a_stall_of_the_daemon_changes_no_sender_and_brings_none_back() -> None:
         )
     one = Commanders().play("wake; high zero; 100 wake; 200 wake > - ? high stalled")
     one.play("100 wake; 100 wake; 100 wake; 200 wake > - ? high command")
-
-
-def test_a_new_timeout_applies_to_a_sender_that_drives() -> None:
-    one = Commanders(armed=True).play("high go; 300 > -")
-    one.commands = CommandsConfig((Source("high", 100, timeout=0.5),))
-    one.play("> high")
 
 
 # sixteen senders of a source are remembered
@@ -163,23 +140,6 @@ def test_zeros_hold_the_robot_and_are_reported_after_three_seconds() -> None:
     one.arbiter.sources["high"].senders[""].zeros_ns = one.now_ns - 7200 * NS_PER_S
     assert one.choice().wait.lasts == 3600.0
     assert one.arbiter.until_ns > one.now_ns
-
-
-def test_a_speed_or_a_silence_begins_anew_and_opposites_are_no_zeros() -> None:
-    one = Commanders(armed=True)
-    after(one, "high zero", 5.0)
-    one.play("100 high go")
-    assert after(one, "high zero", 2.9) == Wait("nothing")
-    one.wait(300)
-    assert after(one, "high zero", 2.9) == Wait("nothing")
-    assert after(one, "high zero", 0.3).what == "zeros"
-    assert after(one, "high cancelled", 4.0) == Wait("nothing")
-
-
-def test_speeds_of_an_unarmed_sender_are_reported_after_three_seconds() -> None:
-    one = Commanders()
-    assert after(one, "high go", 3.0) == Wait("neutral", "high", 1.0)
-    assert after(one, "high go", 0.2) == Wait("neutral", "high", 1.0, lasts=3.0)
 
 
 # what a refused sender waits for
