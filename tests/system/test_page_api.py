@@ -223,7 +223,7 @@ async def test_recordings_are_listed_and_downloaded(page: Page, daemon: Daemon) 
 
 @pytest.mark.slow
 def test_the_example_of_the_page_drives_as_pasted(page: Page, bus: Bus) -> None:
-    text = (ROOT / "deploy/web/README.md").read_text()
+    text = (ROOT / "deploy/manual/pages/howto/http.md").read_text()
     (code,) = re.findall(r"^```python\n(.*?)^```", text, re.S | re.M)
     assert "http://127.0.0.1:8080" in code
     before = bus.state()["x"]

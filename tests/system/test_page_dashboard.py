@@ -35,7 +35,7 @@ pytestmark = pytest.mark.network
 
 NODE = shutil.which("node")
 
-MANUAL = ROOT / "deploy/web/README.md"
+MANUAL = ROOT / "deploy/manual/pages/howto/dashboard.md"
 
 
 def block(language: str) -> str:

@@ -40,7 +40,7 @@ def of_the_page(language: str, words: str) -> Block:
     (match,) = (
         block
         for block in blocks(language)
-        if block.page == "deploy/web/README.md" and words in block.text
+        if block.page == "deploy/manual/pages/howto/phone.md" and words in block.text
     )
     return match
 

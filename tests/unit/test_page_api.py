@@ -63,9 +63,11 @@ def test_every_schema_is_valid_json_schema() -> None:
         Draft202012Validator.check_schema(schema)
 
 
-PAGE = (Path(__file__).parents[2] / "deploy/web/README.md").read_text()
+MANUAL = Path(__file__).parents[2] / "deploy/manual/pages"
 
-TO_IT = PAGE.partition("| message to the robot |")[2].partition("| message from the robot |")[0]
+SOCKET = (MANUAL / "reference/websocket.md").read_text()
+
+TO_IT = SOCKET.partition("| message to the robot |")[2].partition("| message from the robot |")[0]
 
 MESSAGES = [one for one in re.findall(r"`(\{.*?\})`", TO_IT) if "..." not in one]
 
@@ -158,7 +160,8 @@ def named(cell: str) -> set[tuple[str, str]]:
 
 
 def test_the_page_has_a_row_for_each_path_that_programs_may_use() -> None:
-    table = PAGE.partition("| request | meaning |")[2].partition("Over the WebSocket")[0]
+    page = (MANUAL / "howto/http.md").read_text()
+    table = page.partition("| request | meaning |")[2].partition("Over the WebSocket")[0]
     routes = {
         route for line in table.splitlines() for route in named("".join(line.split("|")[1:2]))
     }

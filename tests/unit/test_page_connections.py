@@ -155,7 +155,7 @@ async def test_requests_behind_the_present_one_are_bounded(more: str) -> None:
 
 
 def test_the_manual_states_the_limits() -> None:
-    page = Path(__file__).parents[2] / "deploy" / "web" / "README.md"
+    page = Path(__file__).parents[2] / "deploy/manual/pages/reference/websocket.md"
     text = " ".join(page.read_text(encoding="utf-8").split())
     for words in (
         f"{MAX_CONNECTIONS} connections from other machines, {MAX_OF_NETWORK} of them from one",
