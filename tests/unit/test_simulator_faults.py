@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import inspect
 from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager, ExitStack, suppress
 from itertools import pairwise
@@ -16,7 +15,7 @@ from acsard.core.config.settings import Config, SimConfig
 from acsard.core.simulator.fake_mcu import MS, RESET_NS, FakeMcu
 from acsard.core.simulator.faults import Faults
 from tests.each import each
-from tests.unit.test_simulator_board import (
+from tests.unit.test_simulator import (
     LINE,
     LINE_NS,
     SPEEDS,
@@ -100,23 +99,6 @@ def test_a_frozen_encoder_keeps_its_last_speed_while_its_wheel_stops() -> None:
     assert mcu.vehicle.speeds == STILL
 
 
-def test_a_muted_board_still_identifies_itself() -> None:
-    mcu = FakeMcu(TRUE)
-    with mcu.mute():
-        mcu.receive(0, b"?\r\n")
-        assert joined(replies(mcu, 20 * MS)).startswith(b"!acsard-mcu ")
-
-
-@pytest.mark.parametrize(("fault", "every"), [("lost_commands", 2), ("bit_errors", 1)])
-def test_a_command_that_a_fault_takes_is_recorded_too(fault: str, every: int) -> None:
-    mcu = FakeMcu(TRUE)
-    with getattr(mcu, fault)(every=every):
-        mcu.receive(0, LINE * 2)
-        mcu.advance(20 * MS)
-    assert mcu.valid_lines == 1
-    assert len(mcu.heard) == 2
-
-
 @pytest.mark.parametrize(
     ("fault", "fed", "drives_s"), [("no_watchdog", b"", 60), ("watchdog_fed_by_bad_lines", b"x", 0)]
 )
@@ -141,28 +123,6 @@ def test_a_slow_board_acts_and_answers_later_by_its_delay() -> None:
         assert mcu.vehicle.set_points == STILL
         ((late, _),) = replies(mcu, 100 * MS)
     assert late == prompt[0] + 30 * MS
-
-
-def test_replies_longer_than_the_commands_are_lost_once_the_output_buffer_is_full() -> None:
-    mcu, count = FakeMcu(TRUE), 1000
-    with mcu.spaces():
-        mcu.receive(0, LINE * count)
-        chunks = replies(mcu, 10_000 * MS)
-    assert count * 0.85 < len(chunks) < count * 0.95
-    assert chunks[-1][0] < count * LINE_NS + 30 * MS
-    assert {len(line) for _, line in chunks} == {len(LINE) + 3}
-
-
-@pytest.mark.parametrize(
-    ("fault", "front"), [("dead_motor", [0.0, 12.5]), ("reversed_motor", [8.75, 12.5])]
-)
-def test_a_motor_whose_wires_are_swapped_keeps_its_own_fault(
-    fault: str, front: list[float]
-) -> None:
-    mcu = FakeMcu(TRUE)
-    with mcu.swapped_motors(0, 1), getattr(mcu, fault)(0):
-        drive(mcu, 0, 2)
-        assert mcu.vehicle.set_points == [*front, *SPEEDS[2:]]
 
 
 @each(
@@ -236,42 +196,6 @@ def switches(faults: Faults) -> dict[str, object]:
     return {k: v for k, v in vars(faults).items() if not k.startswith("_")}
 
 
-def test_every_fault_without_required_arguments_is_in_the_list_of_faults() -> None:
-    methods = vars(Faults) | vars(FakeMcu)
-    free = {
-        name
-        for name, method in methods.items()
-        if callable(method) and not name.startswith("_")
-        if inspect.signature(method).return_annotation in ("Fault", "Iterator[None]")
-        if all(
-            p.default is not p.empty
-            for p in list(inspect.signature(method).parameters.values())[1:]
-        )
-    }
-    assert sorted(FAULTS) == sorted(free)
-
-
-BOARDS = ("free_running", "estop", "bumpers")
-"""Faults that need the events of the board, so `fake_mcu.py` has them."""
-
-
-@each("name", [name for name in FAULTS if name not in BOARDS])
-def test_a_fault_changes_its_switch_and_restores_it(name: str) -> None:
-    faults = Faults()
-    before = switches(faults)
-    with getattr(faults, name)():
-        assert switches(faults) != before
-    assert switches(faults) == before
-
-
-def test_a_fault_of_every_fifth_reply_hits_each_fifth_reply() -> None:
-    faults = Faults()
-    with faults.lost_replies(every=5):
-        hits = [faults._hit("reply", faults.lose_reply) for _ in range(10)]
-    assert hits == [False, False, False, False, True] * 2
-    assert not any(faults._hit("reply", faults.lose_reply) for _ in range(10))
-
-
 def test_a_bit_error_flips_one_bit_and_a_different_one_each_time() -> None:
     faults, data = Faults(), bytes(40)
     with faults.bit_errors(every=1):
@@ -281,35 +205,20 @@ def test_a_bit_error_flips_one_bit_and_a_different_one_each_time() -> None:
     assert faults._damaged(data) == data
 
 
-def test_bit_errors_leave_empty_data_unchanged() -> None:
-    faults = Faults()
-    with faults.bit_errors(every=1):
-        assert faults._damaged(b"") == b""
-
-
 EXAMPLE = {"m": "b", "mm": "b:c", "mn": "b:2", "n": "9600", "nn": "5:0.1", "nnn": "1:5:2"}
 EACH = (*FAULTS, *(f"{name}={EXAMPLE[kinds]}" for name, kinds in ARGUMENTS.items()))
 
 
-def test_each_named_fault_can_be_turned_on_and_off() -> None:
+def test_each_named_fault_can_be_turned_on_and_off_and_is_active_from_the_start_if_configured() -> (
+    None
+):
     mcu = FakeMcu(Config())
     before = dict(vars(mcu))
     for text in EACH:
+        configured = FakeMcu(Config(sim=SimConfig(faults=(text, "ftdi"))))
         with mcu.switched_on(named(text)):
             assert vars(mcu) != before, text
+            for switch in switches(Faults()).keys() - {"latency_ns"}:
+                assert getattr(configured, switch) == getattr(mcu, switch), (text, switch)
         assert vars(mcu) == before, text
-
-
-def test_a_fault_in_the_configuration_is_active_from_the_start() -> None:
-    for text in EACH:
-        mcu, faulty_mcu = FakeMcu(Config()), FakeMcu(Config(sim=SimConfig(faults=(text,))))
-        with mcu.switched_on(named(text)):
-            for switch in switches(Faults()):
-                assert getattr(faulty_mcu, switch) == getattr(mcu, switch), (text, switch)
-
-
-def test_several_faults_in_the_configuration_are_active_together() -> None:
-    mcu = FakeMcu(Config(sim=SimConfig(faults=("ftdi", "stalls=5:0.15"))))
-    assert (mcu.latency_ns, mcu.stall_every_ns, mcu.stall_ns) == (
-        16_000_000, 5_000_000_000, 150_000_000,
-    )  # fmt: skip
+        assert configured.latency_ns == 16_000_000

@@ -1,4 +1,4 @@
-"""Tests of the simulated base: motors with a lag, and the robot's path that follows from them."""
+"""The simulated base and what is observed of it: motors with a lag, the true path, the gyro."""
 
 from __future__ import annotations
 
@@ -8,24 +8,32 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from acsard.core.config.settings import DriveConfig, SimConfig
+from acsard.core.config.settings import Config, DriveConfig, OdometryConfig, SimConfig
+from acsard.core.incoming.commands import Arrival
+from acsard.core.incoming.imu import reading
+from acsard.core.messages.encodings import FORMATS, Format, encode
+from acsard.core.messages.schema import Time, Vector3
+from acsard.core.simulator.fake_mcu import MS, FakeMcu
+from acsard.core.simulator.simulated_robot import OBSERVATION_PERIOD_NS, Observation, WatchedMcu
+from acsard.core.simulator.true_messages import true_pose, turn_rate
 from acsard.core.simulator.vehicle import Vehicle
+from acsard.core.values import Pose
 from tests.each import each
 
-LAG = 0.1
-RADIUS, TRACK = 0.05, 0.30
+LAG, RADIUS, TRACK = 0.1, 0.05, 0.30
+SPIN = (3.0, -3.0, -3.0, 3.0)
+"""Set points that the host takes for 1 rad/s on the spot."""
 
-speed = st.floats(-50, 50)
-four = st.lists(speed, min_size=4, max_size=4)
-
-
-def vehicle(lag: float = LAG, drive: DriveConfig | None = None) -> Vehicle:
-    return Vehicle(SimConfig(motor_time_constant=lag), drive or DriveConfig())
+four = st.lists(st.floats(-50, 50), min_size=4, max_size=4)
 
 
-def moved(seconds: float, *set_points: float, lag: float = 0.0, **changes: float) -> Vehicle:
+def moved(
+    seconds: float, *set_points: float, lag: float = 0.0, drive: DriveConfig | None = None,
+    track: float = 1.0, **changes: float,
+) -> Vehicle:  # fmt: skip
     """Return a vehicle after this time from rest; a, b, c, d are right, left, left, right."""
-    made = vehicle(lag)
+    sim = SimConfig(motor_time_constant=lag, track_multiplier=track)
+    made = Vehicle(sim, drive or DriveConfig())
     for name, value in changes.items():
         setattr(made, name, value)
     made.set_points[:] = set_points
@@ -33,141 +41,77 @@ def moved(seconds: float, *set_points: float, lag: float = 0.0, **changes: float
     return made
 
 
-def test_the_vehicle_stands_still_until_it_is_commanded_to_move() -> None:
-    made = vehicle()
-    made.advance(100.0)
-    assert made.speeds == made.angles == [0.0] * 4
-    assert (made.pose.x, made.pose.y, made.pose.yaw) == (0.0, 0.0, 0.0)
-
-
 @each("seconds", [0.001, 0.05, 0.1, 0.5, 3.0])
-def test_a_motor_approaches_its_set_point_exponentially(seconds: float) -> None:
-    made = moved(seconds, 10.0, -5.0, 0.0, 2.0, lag=LAG)
-    share = 1 - math.exp(-seconds / LAG)
+@each("lag", [0.0, LAG])
+def test_a_motor_approaches_its_set_point_exponentially(seconds: float, lag: float) -> None:
+    made = moved(seconds, 10.0, -5.0, 0.0, 2.0, lag=lag)
+    share = 1 - math.exp(-seconds / lag) if lag else 1.0
     assert made.speeds == pytest.approx([10.0 * share, -5.0 * share, 0.0, 2.0 * share])
-    turned = seconds - LAG * share
+    turned = seconds - lag * share
     assert made.angles == pytest.approx([10.0 * turned, -5.0 * turned, 0.0, 2.0 * turned])
-
-
-def test_a_motor_reaches_63_percent_after_one_time_constant() -> None:
-    assert moved(LAG, 10.0, 10.0, 10.0, 10.0, lag=LAG).speeds == pytest.approx(
-        [6.3212] * 4, abs=1e-4
-    )
-
-
-def test_without_lag_a_motor_reaches_its_set_point_instantly() -> None:
-    made = moved(0.001, 1.0, 2.0, 3.0, 4.0)
-    assert made.speeds == [1.0, 2.0, 3.0, 4.0]
-    assert made.angles == pytest.approx([0.001, 0.002, 0.003, 0.004])
-
-
-@given(st.lists(st.floats(1e-4, 0.5), min_size=1, max_size=12), four, four)
-def test_speeds_and_angles_do_not_depend_on_the_time_steps(
-    pieces: list[float], start: list[float], goal: list[float]
-) -> None:
-    whole, cut = vehicle(), vehicle()
-    for made in (whole, cut):
-        made.set_points[:] = start
-        made.advance(0.2)
-        made.set_points[:] = goal
-    for piece in pieces:
-        cut.advance(piece)
-    whole.advance(sum(pieces))
-    assert cut.speeds == pytest.approx(whole.speeds, abs=1e-6)
-    assert cut.angles == pytest.approx(whole.angles, abs=1e-6)
-
-
-@given(st.lists(st.floats(1e-4, 0.5), min_size=1, max_size=12), speed, speed)
-def test_a_path_from_rest_does_not_depend_on_the_time_steps(
-    pieces: list[float], left: float, right: float
-) -> None:
-    whole, cut = vehicle(), vehicle()
-    whole.set_points[:] = cut.set_points[:] = [right, left, left, right]
-    for piece in pieces:
-        cut.advance(piece)
-    whole.advance(sum(pieces))
-    assert (cut.pose.x, cut.pose.y) == pytest.approx((whole.pose.x, whole.pose.y), abs=1e-6)
-    assert math.remainder(cut.pose.yaw - whole.pose.yaw, math.tau) == pytest.approx(0.0, abs=1e-6)
-
-
-@pytest.mark.parametrize("dt", [0.0, -1.0])
-def test_a_time_step_of_zero_or_less_moves_nothing(dt: float) -> None:
-    made = moved(1.0, 5.0, 5.0, 5.0, 5.0, lag=LAG)
-    before = (list(made.speeds), list(made.angles), made.pose)
-    made.advance(dt)
-    assert (made.speeds, made.angles, made.pose) == before
-
-
-def test_a_stopped_motor_comes_to_a_complete_rest() -> None:
-    made = moved(1.0, 5.0, 5.0, 5.0, 5.0, lag=LAG)
+    for nothing in (0.0, -1.0):
+        made.advance(nothing)
+    assert made.angles[0] == pytest.approx(10.0 * turned)
     made.set_points[:] = [0.0] * 4
     made.advance(10.0)
     assert made.speeds == [0.0] * 4
 
 
-def test_straight_ahead_the_distance_is_radius_times_angle() -> None:
-    made = moved(2.0, 10.0, 10.0, 10.0, 10.0)
-    assert made.pose.x == pytest.approx(10.0 * 2.0 * RADIUS)
-    assert (made.pose.y, made.pose.yaw) == (0.0, 0.0)
-    assert moved(2.0, -10.0, -10.0, -10.0, -10.0).pose.x == pytest.approx(-1.0)
+@given(st.lists(st.floats(1e-4, 0.5), min_size=1, max_size=12), four)
+def test_the_motion_from_rest_does_not_depend_on_the_time_steps(
+    pieces: list[float], goal: list[float]
+) -> None:
+    whole, cut = moved(sum(pieces), *goal, lag=LAG), moved(0.0, *goal, lag=LAG)
+    for piece in pieces:
+        cut.advance(piece)
+    assert cut.speeds == pytest.approx(whole.speeds, abs=1e-6)
+    assert cut.angles == pytest.approx(whole.angles, abs=1e-6)
+    assert (cut.pose.x, cut.pose.y) == pytest.approx((whole.pose.x, whole.pose.y), abs=1e-6)
+    assert math.remainder(cut.pose.yaw - whole.pose.yaw, math.tau) == pytest.approx(0.0, abs=1e-6)
 
 
-def test_motors_a_and_d_are_on_the_right() -> None:
-    assert moved(0.1, 1.0, -1.0, -1.0, 1.0).pose.yaw == pytest.approx(2 * 0.1 * RADIUS / TRACK)
-    assert moved(0.1, 1.0, 0.0, 0.0, 1.0).pose.yaw > 0
-    assert moved(0.1, 0.0, 1.0, 1.0, 0.0).pose.yaw < 0
+CURVE = ((0.5 + 0.5 * TRACK / 2) / RADIUS, (0.5 - 0.5 * TRACK / 2) / RADIUS)
+"""Right and left speed for 0.5 m/s and 0.5 rad/s, a circle of 1 m radius."""
 
 
-def test_a_turn_on_the_spot_does_not_change_the_position() -> None:
-    made = moved(0.7, 3.0, -3.0, -3.0, 3.0)
-    assert (made.pose.x, made.pose.y) == pytest.approx((0.0, 0.0))
-
-
-def test_a_quarter_circle_ends_one_radius_ahead_and_one_radius_to_the_side() -> None:
-    # v = 0.5 m/s and w = 0.5 rad/s give a circle of 1 m radius.
-    right, left = (0.5 + 0.5 * TRACK / 2) / RADIUS, (0.5 - 0.5 * TRACK / 2) / RADIUS
-    made = moved(math.pi, right, left, left, right)
-    assert (made.pose.x, made.pose.y) == pytest.approx((1.0, 1.0))
-    assert made.pose.yaw == pytest.approx(math.pi / 2)
-
-
-def test_the_mean_wheel_speed_of_each_side_moves_the_vehicle() -> None:
-    assert moved(0.5, 6.0, 1.0, 5.0, 2.0).pose == moved(0.5, 4.0, 3.0, 3.0, 4.0).pose
-
-
-def test_the_yaw_stays_within_half_a_turn() -> None:
-    made = moved(12.0, 3.0, -3.0, -3.0, 3.0)
-    assert made.pose.yaw == pytest.approx(math.remainder(12.0, math.tau))
+@each(
+    ("seconds", "set_points", "pose"),
+    [
+        (100.0, (0.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0)),
+        (2.0, (10.0, 10.0, 10.0, 10.0), (1.0, 0.0, 0.0)),
+        (2.0, (-10.0, -10.0, -10.0, -10.0), (-1.0, 0.0, 0.0)),
+        (0.7, SPIN, (0.0, 0.0, 0.7)), (12.0, SPIN, (0.0, 0.0, 12.0 - 4 * math.pi)),
+        (math.pi, (CURVE[0], CURVE[1], CURVE[1], CURVE[0]), (1.0, 1.0, math.pi / 2)),
+        # The mean of each side counts.
+        (math.pi, (CURVE[0] + 1, CURVE[1] - 2, CURVE[1] + 2, CURVE[0] - 1),
+         (1.0, 1.0, math.pi / 2)),
+    ],
+)  # fmt: skip
+def test_the_path_follows_from_the_wheels(
+    seconds: float, set_points: tuple[float, ...], pose: tuple[float, ...]
+) -> None:
+    made = moved(seconds, *set_points)
+    assert (made.pose.x, made.pose.y, made.pose.yaw) == pytest.approx(pose)
+    assert math.remainder(made.turned - made.pose.yaw, math.tau) == pytest.approx(0.0, abs=1e-9)
 
 
 def test_the_radius_multipliers_and_the_effective_track_shape_the_path() -> None:
-    drive = DriveConfig(
-        wheel_radius=0.1,
-        wheel_separation=0.5,
-        wheel_separation_multiplier=2.0,
-        left_wheel_radius_multiplier=0.9,
-        right_wheel_radius_multiplier=1.1,
-    )
-    made = vehicle(0.0, drive)
-    made.set_points[:] = [1.0] * 4
-    made.advance(0.5)
+    drive = DriveConfig(0.1, 0.5, 2.0, 0.9, 1.1)
+    made = moved(0.5, 1.0, 1.0, 1.0, 1.0, drive=drive)
     assert made.pose.yaw == pytest.approx(0.5 * (0.11 - 0.09) / 1.0)
     assert math.hypot(made.pose.x, made.pose.y) == pytest.approx(0.5 * 0.1, rel=1e-4)
+    # The host does not know the true track.
+    assert moved(10.0, *SPIN, track=1.6).turned == pytest.approx(10.0 / 1.6)
 
 
-@pytest.mark.parametrize("slip", [0.0, 0.25, 1.0])
-def test_slip_reduces_the_turn_by_its_share_but_not_the_distance(slip: float) -> None:
-    turned = moved(0.1, 3.0, -3.0, -3.0, 3.0, turn_slip=slip)
-    assert turned.pose.yaw == pytest.approx((1 - slip) * 0.1)
-    assert turned.angles == pytest.approx([0.3, -0.3, -0.3, 0.3])
-    assert moved(1.0, 3.0, 3.0, 3.0, 3.0, turn_slip=slip).pose.x == pytest.approx(0.15)
-
-
-@pytest.mark.parametrize("load", [0.0, 0.25, 1.0])
-def test_load_reduces_every_speed_by_its_share(load: float) -> None:
-    made = moved(2.0, 10.0, 10.0, -10.0, 10.0, load=load)
-    assert made.speeds == pytest.approx([s * (1 - load) for s in (10.0, 10.0, -10.0, 10.0)])
-    assert made.angles == pytest.approx([s * (1 - load) * 2 for s in (10.0, 10.0, -10.0, 10.0)])
+@pytest.mark.parametrize("share", [0.0, 0.25, 1.0])
+def test_slip_reduces_the_turn_and_load_every_speed_by_its_share(share: float) -> None:
+    slipped = moved(0.1, *SPIN, turn_slip=share)
+    assert slipped.pose.yaw == pytest.approx((1 - share) * 0.1)
+    assert slipped.angles == pytest.approx([0.3, -0.3, -0.3, 0.3])
+    assert moved(1.0, 3.0, 3.0, 3.0, 3.0, turn_slip=share).pose.x == pytest.approx(0.15)
+    loaded = moved(2.0, 10.0, 10.0, -10.0, 10.0, load=share)
+    assert loaded.speeds == pytest.approx([s * (1 - share) for s in (10.0, 10.0, -10.0, 10.0)])
 
 
 @pytest.mark.parametrize("speed", [0.5, -0.12])
@@ -182,20 +126,55 @@ def test_a_push_moves_the_vehicle_whatever_its_motors_do(speed: float) -> None:
     assert math.dist((made.pose.x, made.pose.y), (before.x, before.y)) > 1.5 * abs(speed)
 
 
-# properties that the host does not know
+# what is observed
 
-SPIN = (3.0, -3.0, -3.0, 3.0)
-"""Set points that the host takes for 1 rad/s on the spot."""
-
-
-def test_a_wider_true_track_reduces_the_true_turn() -> None:
-    made = Vehicle(SimConfig(motor_time_constant=0.0, track_multiplier=1.6), DriveConfig())
-    made.set_points[:] = SPIN
-    made.advance(10.0)
-    assert made.turned == pytest.approx(10.0 / 1.6)
+TRUE = Config(sim=SimConfig(motor_time_constant=0.0, track_multiplier=1.6))
+LINE = b"ap02.00,bn02.00,cn02.00,dp02.00\r\n"
+RATE = 2.0 * 2 * RADIUS / TRACK / 1.6
+"""Turn rate that the line causes, rad/s."""
 
 
-def test_the_total_turn_counts_whole_turns_that_the_yaw_of_the_pose_wraps() -> None:
-    made = moved(12.0, *SPIN)
-    assert made.turned == pytest.approx(12.0)
-    assert math.remainder(made.turned - made.pose.yaw, math.tau) == pytest.approx(0.0, abs=1e-9)
+def test_the_robot_is_observed_every_10_ms_for_any_step_size() -> None:
+    for step_ms in (1, 5, 20):
+        seen: list[Observation] = []
+        mcu = WatchedMcu(TRUE, 0, seen.append)
+        assert mcu.next_ns() == OBSERVATION_PERIOD_NS
+        for ms in range(0, 1001, step_ms):
+            if ms >= 100 and ms % 20 == 0:
+                mcu.receive(ms * MS, LINE)
+            mcu.advance(ms * MS)
+        assert [one.at_ns for one in seen] == [(n + 1) * OBSERVATION_PERIOD_NS for n in range(100)]
+        # The true pose of its time, and the true turn rate
+        assert seen[-1].pose.yaw - seen[49].pose.yaw == pytest.approx(RATE * 0.5)
+        assert [one.gyro for one in seen[50:]] == pytest.approx([RATE] * 50)
+        assert sum(one.gyro for one in seen) * 0.01 == pytest.approx(seen[-1].pose.yaw)
+
+
+def test_an_observed_board_answers_the_same_bytes() -> None:
+    watched, alone = WatchedMcu(TRUE, 0, lambda sight: None), FakeMcu(TRUE)
+    for mcu in (watched, alone):
+        mcu.receive(0, LINE)
+    assert watched.next_ns() < OBSERVATION_PERIOD_NS
+    assert watched.advance(100 * MS) == alone.advance(100 * MS) != b""
+
+
+SIGHT = Observation(7, Pose(1.5, -2.0, math.pi / 2), 0.25)
+WALL_NS = 1_700_000_003_250_000_001
+
+
+def test_the_true_pose_has_the_time_of_the_observation_and_no_frame_of_the_odometry() -> None:
+    pose = true_pose(SIGHT, WALL_NS)
+    assert pose.header.stamp == Time(1_700_000_003, 250_000_001)
+    frames = OdometryConfig()
+    assert pose.header.frame_id not in (frames.odom_frame, frames.base_frame)
+    assert pose.pose.position == Vector3(1.5, -2.0, 0.0)
+    turn = pose.pose.orientation
+    assert (turn.x, turn.y, turn.z, turn.w) == pytest.approx((0.0, 0.0, 0.5**0.5, 0.5**0.5))
+
+
+@pytest.mark.parametrize("form", FORMATS)
+def test_a_sample_of_the_simulated_gyro_is_read_like_one_of_any_gyro(form: Format) -> None:
+    message = turn_rate(SIGHT, "base_link", WALL_NS)
+    sample, _ = reading(Arrival("imu", True, encode(message, form), "", 7, None, ""))
+    assert (sample.at_ns, sample.stamp_ns, sample.rate) == (7, WALL_NS, 0.25)
+    assert message.orientation_covariance[0] == message.linear_acceleration_covariance[0] == -1.0

@@ -1,24 +1,31 @@
-"""The fake microcontroller against an independent model of its firmware.
+"""The fake microcontroller against an independent model of its firmware, and its lines.
 
-`TRUE` has no motor lag and fine encoders, so it reports exactly the commanded speeds.
+`tests/firmware` compares it with the machine code of the real board. `TRUE` has no motor lag and
+fine encoders, so it reports exactly the commanded speeds.
 """
 
 from __future__ import annotations
 
+import binascii
 import re
-from itertools import pairwise
-from typing import Any
+from itertools import pairwise, permutations
+from typing import Any, get_args
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from msgspec.structs import replace
 
-from acsard.core.config.settings import Config, McuConfig, SimConfig
+from acsard.core.config.settings import Baud, Config, McuConfig, SimConfig
+from acsard.core.simulator import protocol
+from acsard.core.simulator.baud_mismatch import garbled
 from acsard.core.simulator.fake_mcu import MS, RESET_NS, FakeMcu
+from acsard.core.simulator.protocol import Command, latched, plain_only, prefix, reference
+from acsard.core.simulator.virtual_wire import VirtualWire
 from tests.each import each
 
-LINE = b"ap12.50,bn08.75,cp15.00,dn10.25\r\n"
+PLAIN = b"ap12.50,bn08.75,cp15.00,dn10.25"
+LINE = PLAIN + b"\r\n"
 SPEEDS = [12.5, -8.75, 15.0, -10.25]
 ZERO = b"ap00.00,bp00.00,cp00.00,dp00.00\r\n"
 STILL = [0.0] * 4
@@ -99,7 +106,9 @@ def test_the_board_obeys_and_answers_whole_lines_only_and_forgets_them_after_300
     mcu, model, now = FakeMcu(TRUE), Model(), 0
     answers = 0
     for wait_ms, line in sent:
-        mcu.receive(now * MS, line)
+        cut = len(line) // 3  # in two pieces, it is one line
+        mcu.receive(now * MS, line[:cut])
+        mcu.receive(now * MS, line[cut:])
         model.hears(line, now + len(line) * 10e3 / 115200)
         answers += len(replies(mcu, (now + 15) * MS))  # on the wire, and 1 to 5 ms later
         assert mcu.vehicle.set_points == pytest.approx(model.speeds)
@@ -112,26 +121,18 @@ def test_the_board_obeys_and_answers_whole_lines_only_and_forgets_them_after_300
     assert mcu.valid_lines == answers == model.valid
 
 
-@each("cut", range(1, 33))
-def test_a_line_in_two_pieces_is_one_line(cut: int) -> None:
-    mcu = FakeMcu(TRUE)
-    mcu.receive(0, LINE[:cut])
-    mcu.advance(20 * MS)
-    assert mcu.vehicle.set_points == STILL
-    mcu.receive(20 * MS, LINE[cut:])
-    mcu.advance(60 * MS)
-    assert mcu.vehicle.set_points == SPEEDS
-    assert [line for _, line in mcu.heard] == [LINE]
-
-
 def test_the_board_starts_silent_and_then_reports_its_speeds_in_the_form_of_the_line() -> None:
     mcu = FakeMcu(TRUE)
     assert replies(mcu, 1000 * MS) == []
     assert mcu.next_ns() is None
     assert [data for _, data in drive(mcu, 1000 * MS, 6)] == [ZERO] + [LINE] * 5
-    assert drive(FakeMcu(TRUE), 0, 5, b"an00.00,bp00.10,cp99.99,dn99.99\n")[-1][1] == (
-        b"ap00.00,bp00.10,cp99.99,dn99.99\r\n"
-    )
+    # Two reads of the encoders within 4 ms give the same figures.
+    mcu = FakeMcu(TRUE)
+    drive(mcu, 0, 4)
+    mcu.receive(50 * MS, b"ap01.00,bp01.00,cp01.00,dp01.00\r\n" + ZERO)
+    assert [data for _, data in replies(mcu, 80 * MS)] == [LINE] * 2
+    mcu.receive(80 * MS, ZERO)
+    assert replies(mcu, 100 * MS)[0][1] != LINE
 
 
 def test_coarse_encoders_count_whole_steps_and_motors_lag() -> None:
@@ -146,25 +147,12 @@ def test_coarse_encoders_count_whole_steps_and_motors_lag() -> None:
     assert rising[-1] == 12.5
 
 
-def test_two_reads_of_the_encoders_within_4_ms_give_the_same_figures() -> None:
-    mcu = FakeMcu(TRUE)
-    drive(mcu, 0, 4)
-    mcu.receive(50 * MS, b"ap01.00,bp01.00,cp01.00,dp01.00\r\n" + ZERO)
-    assert [data for _, data in replies(mcu, 80 * MS)] == [LINE] * 2
-    mcu.receive(80 * MS, ZERO)
-    assert replies(mcu, 100 * MS)[0][1] != LINE
-
-
-# Time.
-
-
 @pytest.mark.parametrize(("baud", "line_ns"), [(9600, 34_375_000), (115200, 2_864_583)])
 def test_lines_and_answers_take_their_time_on_the_wire_one_after_the_other(
     baud: Any, line_ns: int
 ) -> None:
     mcu = FakeMcu(replace(TRUE, mcu=McuConfig(baud_rate=baud)))
-    mcu.receive(1000, LINE)
-    mcu.receive(1000, LINE * 7)
+    mcu.receive(1000, LINE * 8)
     sent = [when for when, _ in replies(mcu, 2000 * MS)]
     assert [at for at, _ in mcu.heard] == pytest.approx(
         [1000 + n * line_ns for n in range(1, 9)], abs=8
@@ -172,14 +160,10 @@ def test_lines_and_answers_take_their_time_on_the_wire_one_after_the_other(
     assert 1 * MS <= sent[0] - 1000 - 2 * line_ns <= 5 * MS
     assert len(sent) == 8
     assert all(later - sooner >= line_ns - 1 for sooner, later in pairwise(sent))
-
-
-def test_processing_takes_a_varying_time_of_one_to_five_milliseconds() -> None:
-    chunks = drive(FakeMcu(TRUE), 0, 40)
-    delays = [when - n * 10 * MS - 2 * LINE_NS for n, (when, _) in enumerate(chunks)]
-    assert len(chunks) >= 39
-    assert 1 * MS - 10 <= min(delays) < max(delays) - 2 * MS
-    assert max(delays) <= 5 * MS + 10
+    delays = [
+        at - n * 10 * MS - 2 * LINE_NS for n, (at, _) in enumerate(drive(FakeMcu(TRUE), 0, 40))
+    ]
+    assert 1 * MS - 10 <= min(delays) < max(delays) - 2 * MS < 3 * MS + 10
 
 
 def test_the_output_does_not_depend_on_how_often_the_board_is_advanced() -> None:
@@ -201,30 +185,114 @@ def test_the_watchdog_stops_the_motors_exactly_300_ms_after_the_line_took_effect
     assert mcu.vehicle.set_points == SPEEDS
     mcu.advance(now_ns + 60_000 * MS)  # late
     assert mcu.vehicle.angles == pytest.approx([speed * 0.3 for speed in SPEEDS])
-    assert mcu.watchdog_trips == 1
     mcu.receive(now_ns + 60_000 * MS, ZERO)
     mcu.advance(now_ns + 90_000 * MS)
     assert mcu.watchdog_trips == 1  # at rest it does not trip
 
 
-def test_a_reset_stops_the_motors_discards_the_wire_and_prints_noise() -> None:
+@pytest.mark.parametrize(("early_ns", "speeds"), [(1, STILL), (0, SPEEDS)])
+def test_a_reset_stops_the_motors_and_a_line_is_obeyed_from_its_exact_end(
+    early_ns: int, speeds: list[float]
+) -> None:
     mcu = FakeMcu(TRUE)
     drive(mcu, 0, 4)
     mcu.receive(40 * MS, LINE + LINE[:10])
     mcu.reset(41 * MS)
     assert mcu.vehicle.set_points == STILL
-    noise = joined(drive(mcu, 50 * MS, (RESET_NS - 20 * MS) // (10 * MS)))
-    assert noise.endswith(b"\n")
+    noise = mcu.advance(41 * MS + RESET_NS - LINE_NS - early_ns)
+    assert noise
     assert b"ap" not in noise
-    assert mcu.vehicle.set_points == STILL
-
-
-@pytest.mark.parametrize(("early_ns", "speeds"), [(1, STILL), (0, SPEEDS)])
-def test_a_line_is_obeyed_from_the_exact_end_of_the_reset(
-    early_ns: int, speeds: list[float]
-) -> None:
-    mcu = FakeMcu(TRUE)
-    mcu.reset(0)
-    mcu.receive(RESET_NS - LINE_NS - early_ns, LINE)
-    mcu.advance(RESET_NS + 20 * MS)
+    mcu.receive(41 * MS + RESET_NS - LINE_NS - early_ns, LINE)
+    mcu.advance(41 * MS + RESET_NS + 20 * MS)
     assert mcu.vehicle.set_points == speeds
+
+
+# The lines of each firmware.
+
+VALUES = {0: 12.5, 1: -8.75, 2: 15.0, 3: -10.25}
+
+
+def closed(body: bytes) -> bytes:
+    """Return the body with its correct checksum and a line end."""
+    return b"%b*%04X\r\n" % (body, binascii.crc_hqx(body, 0))
+
+
+@each(
+    ("line", "command"),
+    [
+        *((PLAIN + end, Command(VALUES)) for end in (b"\r\n", b"\n", b",\r\n", b",\n")),
+        (closed(PLAIN + b"#07"), Command(VALUES, b"07")),
+        (closed(PLAIN + b"#FFS"), Command(VALUES, b"FF", True)),
+        (closed(PLAIN + b"#00GSZ"), Command(VALUES, b"00", True)),
+        (closed(PLAIN + b",#A0S"), Command(VALUES, b"A0", True)),
+        *((line, None) for line in (
+            PLAIN + b"#07\r\n", PLAIN + b"*0000\r\n", closed(PLAIN), closed(PLAIN + b"#7"),
+            closed(PLAIN + b"#0a"), closed(PLAIN + b"#07s"), closed(PLAIN + b"#07A"),
+            closed(PLAIN + b"#07@"), closed(PLAIN + b"#07*"), closed(PLAIN[:-1] + b"#07"),
+            closed(b"#07"), closed(PLAIN + b"#07")[:-3] + b"\r\n",
+            closed(PLAIN + b"#07").replace(b"12.50", b"12.51"), closed(PLAIN + b"#07").lower(),
+            b"\x00" + closed(PLAIN + b"#07"), b"", b"\r\n", b"?", PLAIN[:30], PLAIN[1:],
+            b"\xff" * 50)),
+    ],
+)  # fmt: skip
+def test_a_plain_or_a_checked_line_is_a_command_and_any_other_is_none(
+    line: bytes, command: Command | None
+) -> None:
+    assert reference(line) == command
+    if b"#" not in line and b"*" not in line:
+        assert plain_only(line) == prefix(line) == command
+
+
+def test_the_old_firmwares_obey_a_checked_line_as_a_plain_one() -> None:
+    assert prefix(closed(PLAIN + b"#07S")) == Command(VALUES)
+    assert latched(PLAIN + b",").values == latched(closed(PLAIN + b",#07S")).values == VALUES
+    assert latched(closed(PLAIN + b"#07S")).values == {0: 12.5, 1: -8.75, 2: 15.0}
+    assert plain_only(closed(PLAIN + b"#07")) is None
+
+
+def test_replies_and_the_identity_line_are_written_as_the_firmware_writes_them() -> None:
+    speeds = (12.5, -8.75, 0.0, -120.0)
+    assert protocol.speeds_text(speeds, ",", False) == b"ap12.50,bn08.75,cp00.00,dn99.99"
+    assert protocol.speeds_text(speeds, ", ", True) == b"ap12.50, bn8.75, cp0.00, dn99.99"
+    sample = (65536 + 4000, 1, -1, 32768, -32769)
+    for counts, suffix in (((), b"#07"), (sample, b"#07@0FA00001FFFF80007FFF")):
+        assert PLAIN + protocol.suffix(PLAIN, b"07", counts) + b"\r\n" == closed(PLAIN + suffix)
+    line = protocol.identity(3200, 300, sample=True)
+    assert line == b"!acsard-mcu 1 counts=3200 watchdog_ms=300 check=1 sample=1\r\n"
+    assert reference(line) is prefix(line) is plain_only(line) is None
+
+
+# The wire.
+
+
+def test_a_line_is_answered_at_its_virtual_time_and_garbled_at_a_wrong_baud_rate() -> None:
+    mcu = FakeMcu(Config())
+    wire = VirtualWire(mcu, 1000)
+    wire.open(115200)
+    wire.send(ZERO)
+    ((at_ns, data),) = wire.listen(20_000_000)
+    assert data == ZERO
+    assert 6_700_000 < at_ns < 11_000_000
+    assert wire.listen(10) == []
+    assert wire.now_ns() == 20_000_000
+    wire.open(57600)
+    wire.send(ZERO)
+    assert wire.listen(70_000_000) == []
+    with mcu.wrong_baud(57600):
+        wire.send(b"\r\n" + ZERO)
+        assert wire.listen(120_000_000)[0][1] == ZERO
+    wire.close()
+    with pytest.raises(AssertionError):
+        wire.send(ZERO)
+
+
+@each(("sent", "rx_rate"), list(permutations(get_args(Baud), 2)))
+def test_at_a_wrong_baud_rate_no_line_survives(sent: int, rx_rate: int) -> None:
+    assert garbled(ZERO, sent, sent) == garbled(ZERO, 115200, 117000) == ZERO
+    data = garbled(ZERO * 5, sent, rx_rate)
+    assert ZERO[:-2] not in data
+    assert b"ap0" not in data
+    # At 9600 baud 0x00 is nine low bits and a high one. At 19200 these are 18 low samples without a
+    # stop bit in time. 0xff is one low bit. At 19200 it is a start bit, then a 0 and ones.
+    assert garbled(b"\x00\xff", 9600, 19200)[:1] == b"\x00"
+    assert garbled(b"\xff", 9600, 19200) == b"\xfe"
