@@ -33,6 +33,13 @@ from tests.unit.examples import OUTPUTS, SNAPSHOT
 
 FILES = Path(__file__).parents[1] / "deploy" / "ros2"
 CONFIG = Config()
+
+
+def manual(page: str) -> str:
+    """Return the text of a page of the manual."""
+    return (FILES.parent / f"manual/pages/{page}.md").read_text()
+
+
 WHEEL_SIGNS = {  # x and y of each wheel's position
     CONFIG.joints.front_right: (1, -1),
     CONFIG.joints.front_left: (1, 1),
@@ -275,7 +282,7 @@ def test_the_docking_server_sends_often_enough_on_a_topic_of_its_own() -> None:
     assert docking["base_frame"] == CONFIG.odometry.base_frame
     assert docking["fixed_frame"] == CONFIG.odometry.odom_frame
     assert "/cmd_vel_dock" in published_names("in")
-    assert '("cmd_vel", "cmd_vel_dock")' in (FILES / "README.md").read_text()
+    assert '("cmd_vel", "cmd_vel_dock")' in manual("howto/nav2-docking")
 
 
 def test_nav2s_footprint_has_the_wheels_inside() -> None:
@@ -496,7 +503,7 @@ def test_a_diagnostics_row_at_its_normal_rate_is_not_stale_for_the_aggregator() 
         assert all(start.startswith(prefix) for start in analyzer["startswith"])
 
 
-# README.md
+# the pages
 
 
 def test_the_readme_names_every_file() -> None:
@@ -506,26 +513,26 @@ def test_the_readme_names_every_file() -> None:
             assert f"`{path.name}`" in text, path.name
 
 
-def test_the_readme_has_every_ros_key_with_its_default() -> None:
-    text = (FILES / "README.md").read_text()
+def test_the_manual_has_every_ros_key_with_its_default() -> None:
+    text = manual("howto/ros")
     for field in msgspec.structs.fields(RosConfig):
         default = json.dumps(field.default)
         assert re.search(rf"^{field.name} = {re.escape(default)}( |$)", text, re.M), field.name
 
 
-def test_the_readme_names_every_topic_and_service() -> None:
-    text = (FILES / "README.md").read_text()
+def test_the_manual_names_every_topic_and_service() -> None:
+    text = manual("reference/ros-topics")
     for row in ros_names():
         if not row.type.startswith("rcl_interfaces/"):
             assert f"`{row.name}`" in text, row.name
 
 
-def test_the_readme_starts_a_bridge_over_the_network_below_the_robot_s_namespace() -> None:
+def test_the_manual_starts_a_bridge_over_the_network_below_the_robot_s_namespace() -> None:
     """Over the network each robot has a namespace.
 
     A bridge without this namespace would show ROS nothing of the robot.
     """
-    lines = re.findall(r"^zenoh-bridge-ros2dds .*-e .*$", (FILES / "README.md").read_text(), re.M)
+    lines = re.findall(r"^zenoh-bridge-ros2dds .*-e .*$", manual("howto/bridge"), re.M)
     assert lines
     assert all(" -n /robot1" in line for line in lines)
 

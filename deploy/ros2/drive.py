@@ -56,7 +56,7 @@ def drive(linear: float, angular: float, seconds: float) -> None:
     deadline = time.monotonic() + PATIENCE_S
     while not publisher.get_subscription_count():
         if time.monotonic() > deadline:
-            sys.exit("no program listens on cmd_vel: see Trouble in deploy/ros2/README.md")
+            sys.exit("no program listens on cmd_vel: see page howto/ros-trouble of the manual")
         time.sleep(PERIOD_S)
 
     def hold(linear: float, angular: float, seconds: float) -> None:

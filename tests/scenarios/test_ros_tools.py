@@ -1,7 +1,7 @@
-"""Tools of other projects follow the neutral-first rule, as deploy/ros2/README.md describes.
+"""Tools of other projects follow the neutral-first rule, as the page howto/ros-drive describes.
 
 Each class imitates the rates and the zeros of the tool after which it is named. Each test stops and
-clears the robot while the tool sends commands. Then it does what the README's table asks the person
+clears the robot while the tool sends commands. Then it does what that page's table asks the person
 to do. It shows that these steps are enough, and that the robot stays at rest after fewer steps.
 """
 
@@ -80,7 +80,8 @@ def drives(world: World, act: Callable[[], None]) -> None:
 
 
 def test_the_table_of_the_ros_page_lists_exactly_the_tools_of_this_module() -> None:
-    table = (ROS2 / "README.md").read_text().partition("\n### After a clear\n")[2]
+    page = (ROS2.parent / "manual/pages/howto/ros-drive.md").read_text()
+    table = page.partition("\n## After a clear\n")[2]
     rows = re.findall(r"^\| ([^|]+) \| [^|]+ \| [^|]+ \|$", table.partition("\n## ")[0], re.M)
     assert set(rows) - {"tool"} == TOOLS
 

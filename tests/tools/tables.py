@@ -187,7 +187,7 @@ def _replaced(pattern: str, part: str, text: str) -> str:
 
 FILES: dict[str, Callable[[str], str]] = {
     "deploy/manual/pages/reference/keys.md": _marked("keys", keytable()),
-    "deploy/ros2/README.md": ros_page,
+    "deploy/manual/pages/reference/ros-topics.md": ros_page,
     "deploy/ros2/zenoh-bridge-ros2dds.json5": bridge_file,
     "deploy/zenoh/router.json5": router_file,
     **{name: _whole(write) for name, write in GENERATED.items()},

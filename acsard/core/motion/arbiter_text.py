@@ -16,8 +16,8 @@ from acsard.core.values import NS_PER_S, Event, Ns, Refusal, Wait
 MAX_SENDER_LENGTH = 124
 
 ROS_NEVER = (
-    ' (`ros2 topic pub` with a speed never sends a zero; the section "After a clear" of '
-    "deploy/ros2/README.md lists tools that send one)"
+    " (`ros2 topic pub` with a speed never sends a zero; page howto/ros-drive of the manual lists "
+    "tools that send one)"
 )
 
 
