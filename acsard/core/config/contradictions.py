@@ -357,7 +357,16 @@ def _page_problems(config: Config) -> list[str]:
                 "to write"
             )
     names = {f"web.address[{i}]": address for i, address in enumerate(addresses)}
-    return errors + _repeated("host and port", names, lambda address: address.partition("://")[2])
+    errors += _repeated("host and port", names, lambda address: address.partition("://")[2])
+    for everywhere in (address for address in addresses if "//[::]:" in address):
+        port = everywhere.rpartition(":")[2]
+        errors += [
+            f"{key} = {show(address)}: {everywhere} listens at this address, too, because it "
+            f"listens at all addresses of this machine; remove one of both"
+            for key, address in names.items()
+            if address.endswith(f":{port}") and "//[::]:" not in address
+        ]
+    return errors
 
 
 def _access_problems(config: Config) -> list[str]:

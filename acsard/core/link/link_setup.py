@@ -15,8 +15,8 @@ from acsard.core.link.checked_line import SAMPLE_REQUEST
 from acsard.core.link.codec import Codec
 from acsard.core.values import NS_PER_S, Ns
 
-# Firmware counts for 4 ms and more, and repeats its speeds meanwhile. Nobody knows which of more
-# frequent replies do so: whole counts would be counted twice.
+# Firmware counts for at least 4 ms, and repeats its last speeds in a reply before that. If replies
+# are more frequent than this, a repeated speed looks like a new one, and counts would count twice.
 LEAST_APART_NS = 9_000_000
 
 LATE_STEP_FRACTION = 0.5  # of `quiet_ns`, between two steps: the second is late
