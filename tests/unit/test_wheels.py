@@ -51,6 +51,7 @@ class Bench:
         turn: float | None = None,
         late: bool = False,
         noise: float = 0.0,
+        each: float = PERIOD,
     ) -> float:
         """Feed lines for this time. Return when a wheel was left out, s, or inf.
 
@@ -58,18 +59,16 @@ class Bench:
         """
         time_s, wheels = math.inf, self.wheels
         before, wanted = wheels.status.left_out, None if command is None else speeds_of(command)
-        for number in range(round(seconds / PERIOD)):
+        for number in range(round(seconds / each)):
             more = noise * (number % 2)
             a, b, c, d = (s + more * (s != 0.0) for s in speeds_of(speeds).as_tuple())
-            turned = a * PERIOD, b * PERIOD, c * PERIOD, d * PERIOD
-            by_gyro = None if turn is None else turn * PERIOD
+            turned = a * each, b * each, c * each, d * each
+            by_gyro = None if turn is None else turn * each
             wheels.commanded, wheels.late = wanted, late
             reported = WheelSpeeds(a, b, c, d)
-            wheels.add(
-                turned, reported, PERIOD, by_gyro, self.feedback, self.kinematics, self.count
-            )
+            wheels.add(turned, reported, each, by_gyro, self.feedback, self.kinematics, self.count)
             if wheels.status.left_out != before:
-                time_s = min(time_s, (number + 1) * PERIOD)
+                time_s = min(time_s, (number + 1) * each)
             self.events += [event.kind for event in wheels.events]
             self.pushes += bool(wheels.pushed)
             if wheels.fault is not None:
@@ -107,12 +106,30 @@ def test_wheels_that_follow_a_stop_and_keep_their_last_speed_are_a_warning(keeps
     assert (bench.faults, set(bench.events)) == ([], {"wheel_stuck"})
 
 
-def test_a_robot_that_is_faster_than_its_limiter_for_a_second_is_a_fault() -> None:
-    bench = Bench().driven()
-    bench.run(12.7, 10.0, 0.9)
+@each("counts", [16, 3200])
+@each("speed", [0.8, 1.4, 10.0])
+def test_a_robot_that_is_faster_than_its_limiter_for_a_second_is_a_fault(
+    speed: float, counts: int
+) -> None:
+    """It is beyond a fifth more by 0.3 rad and 1.5 counts, too."""
+    bench, fast = Bench(counts).driven(speed), 1.35 * speed
+    beyond_s = max(0.3, 1.5 * count_angle(counts)) / (fast - 1.2 * speed)
+    bench.run(fast, speed, 0.9 * max(1.0, beyond_s))
     assert bench.faults == []
-    bench.run(12.7, 10.0, 0.8)
+    bench.run(fast, speed, 0.1 * max(1.0, beyond_s) + 0.7)
     assert bench.faults[0] == "wheel_too_fast"
+
+
+def test_a_board_that_repeats_each_count_makes_no_wheel_too_fast() -> None:
+    """It counts for 6.4 ms and is asked each 5 ms, in step with wheels of 16 counts at 1 rad/s."""
+    for counts_of_the_board in (False, True):
+        bench = Bench(counts=0).driven(1.0)
+        if not counts_of_the_board:
+            bench.wheels.steps = (61.36, 61.36, 61.36, 61.36)
+        for _ in range(20):
+            bench.run(61.36, 1.0, 0.01, each=0.005)
+            bench.run(0.0, 1.0, 0.383, each=0.005)
+        assert bench.faults[:1] == ["wheel_too_fast"] * counts_of_the_board
 
 
 @each(

@@ -55,7 +55,12 @@ SMOOTHED_COUNTS, SMOOTHED_S = 3.0, 1.0
 REST_S, REST_ANGLE = 0.5, 0.02  # at least, without a command: the wheel rests
 LEAST_SPEED = 0.05  # m/s, of a runaway that must not look like rest
 
-TOO_FAST, TOO_FAST_S = 1.2, 1.0  # times the largest output of the limiter
+# Times the largest output of the limiter, and rad and counts rolled beyond that, both of them: a
+# sound wheel shows up to a count more than it turned.
+TOO_FAST, TOO_FAST_S, TOO_FAST_ANGLE, TOO_FAST_COUNTS = 1.2, 1.0, 0.3, 1.5
+# Below this time between lines (s), a board may repeat each count of a coarse encoder (rad) for as
+# long as its times and the speed keep step: a sound wheel then looks up to twice as fast.
+REPEATS_S, COARSE_ANGLE = 0.009, math.tau / 200
 PACE_S = 1.5  # faster or slower by `AGREEMENT`, until this is a warning: 2 s with the smoothing
 ROUNDING = 0.006  # rad/s, of a reported speed
 JITTER_S = 0.004  # of the times of lines
@@ -99,6 +104,7 @@ class Block(NamedTuple):
     line: Motors  # the angles of the last line
     speeds: Motors  # in it
     unit: Rad  # of an encoder count
+    repeats: bool  # a count may be in two lines
     limit: Rad  # evidence of a fault
     patience: Seconds  # without an approach
     rest: Seconds  # without motion or a command, after which a wheel rests
@@ -120,8 +126,8 @@ class Wheel(Struct):
     rested: bool = True  # and was not commanded since then
     rest_s: Seconds = 0.0
     rest_angle: Rad = 0.0
-    fast_s: Seconds = 0.0
-    fast_angle: Rad = 0.0
+    fast_s: Seconds = 0.0  # too fast, less the time for which it was not
+    fast_angle: Rad = 0.0  # rolled beyond what the limiter allows, since it was none
     pace_s: Seconds = 0.0
     pace_angle: Rad = 0.0
     reported: RadPerS = 0.0  # in the last line
@@ -160,9 +166,10 @@ class Wheels(Struct):
 
     wheels: tuple[Wheel, Wheel, Wheel, Wheel]
     sides: tuple[Side, Side]
-    # Commanded speeds, for the caller to set. None: the emergency stop may cut the motors' power.
+    # Commanded speeds; the caller sets these three. None: the emergency stop may cut the power.
     commanded: WheelSpeeds | None = STILL
     late: bool = False  # this computer was late, so the board may have stopped the motors
+    steps: Motors = NOTHING  # of the speeds in a line without the board's counts, by one count
     begins: bool = True  # the expected speeds begin at the measured ones
     angles: Motors = NOTHING  # of the block, rad
     turn: Rad = 0.0  # of the block by a gyro
@@ -289,7 +296,9 @@ class Wheels(Struct):
             angles, line = times(angles, share), times(line, share)
         limit, patience = max(FAULT_ANGLE, FAULT_COUNTS * count), FAULT_RESPONSES * lag
         rest = REST_S + 2 * count * kinematics.radius / LEAST_SPEED
-        block = Block(s, angles, line, speeds, count, limit, patience, rest)
+        each = self.seconds / self.lines
+        repeats = each < REPEATS_S and max(self.steps) * each > COARSE_ANGLE
+        block = Block(s, angles, line, speeds, count, repeats, limit, patience, rest)
         if commanded is None:
             self._drop()
             for wheel, angle in zip(self.wheels, angles, strict=True):
@@ -309,7 +318,7 @@ class Wheels(Struct):
         self._compare(block, kinematics)
 
     def _obey(self, block: Block, due: tuple[Rad, Rad]) -> None:
-        s, angles, _, speeds, _, limit, patience, _ = block
+        s, angles, _, speeds, _, _, limit, patience, _ = block
         fastest = 0.0
         for i, wheel in enumerate(self.wheels):
             k, angle = SIDE_OF[i], angles[i]
@@ -351,13 +360,16 @@ class Wheels(Struct):
     def _pace(self, i: int, wheel: Wheel, due: Rad, block: Block) -> None:
         s, angle, peak = block.s, block.angles[i], self.sides[SIDE_OF[i]].peak
         turns, most = abs(wheel.speed), TOO_FAST * peak
-        if wheel.fast_s or 0.0 < most < turns:
+        rolled = wheel.fast_angle + angle
+        beyond = abs(rolled) - most * s
+        if beyond <= 0.0 or wheel.approaches or block.repeats or not peak:
+            wheel.fast_s = wheel.fast_angle = 0.0
+        else:
+            wheel.fast_angle = math.copysign(beyond, rolled)
             # An encoder with few counts looks slow between two of them.
-            wheel.fast_s += s if turns > most else -s
-            wheel.fast_angle += abs(angle) - most * s
-            if wheel.fast_s <= 0.0 or wheel.approaches or not peak:
-                wheel.fast_s = wheel.fast_angle = 0.0
-            elif wheel.fast_s >= TOO_FAST_S and wheel.fast_angle >= block.limit:
+            wheel.fast_s = max(0.0, wheel.fast_s + (s if turns > most else -s))
+            enough = max(TOO_FAST_ANGLE, TOO_FAST_COUNTS * block.unit)
+            if wheel.fast_s >= TOO_FAST_S and beyond >= enough:
                 self._latch("wheel_too_fast", i, peak)
         # Quick or slow motors differ from what is expected after a change of the command.
         steady = abs(wheel.due - wheel.command) < AGREEMENT * abs(wheel.command)
