@@ -44,19 +44,6 @@ def test_file_numbers_increase_whatever_the_clock_shows(tmp_path: Path) -> None:
     assert listed(tmp_path)[1].name == f"000002-19700101T000000Z{SUFFIX}"
 
 
-def test_no_clock_deletes_a_recording(tmp_path: Path) -> None:
-    store = new(tmp_path, 30.0)
-    for year in (2026, 2106, 1970, 2250, 1999):
-        path = record(store, (year - 1970) * 31_556_952 * NS_PER_S, size=5_000_000)
-        os.utime(path, (0, 0))
-        assert store.make_room() == ""
-    assert numbers(tmp_path) == [1, 2, 3, 4, 5]
-    for _ in range(2):
-        record(store, size=5_000_000)
-        store.make_room()
-    assert numbers(tmp_path) == [3, 4, 5, 6, 7], "the order is that of the numbers"
-
-
 @pytest.mark.parametrize(
     ("service", "private", "umask", "wanted"),
     [

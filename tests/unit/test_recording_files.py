@@ -8,7 +8,6 @@ from functools import lru_cache
 from pathlib import Path
 
 import pytest
-from mcap.reader import make_reader
 from msgspec.structs import replace
 
 from acsard.cli import main
@@ -64,14 +63,6 @@ def test_the_newest_recording_is_exported_to_a_named_file_in_the_working_directo
 
 
 @pytest.mark.slow
-def test_a_name_without_an_ending_is_taken(where: Path, here: Path) -> None:
-    assert export(where, "7", "drive") == 0
-    assert export(where, "7", "table", "--csv") == 0
-    assert export(where, "7", "bag", "--rosbag2") == 0
-    assert {path.name for path in here.iterdir()} == {"drive", "table", "bag"}
-
-
-@pytest.mark.slow
 def test_export_takes_a_number_and_a_name_and_overwrites_no_file(
     where: Path, here: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -105,18 +96,6 @@ def test_another_configuration_computes_the_odometry_again(where: Path, here: Pa
         for name in ("a.csv", "b.csv")
     )
     assert further == pytest.approx(2 * far, rel=0.02)
-
-
-def test_a_truncated_recording_is_exported_up_to_its_end(
-    where: Path, here: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    cut = here / "cut.rec.zst"
-    cut.write_bytes((where / RECORDED).read_bytes()[:-100])
-    assert export(where, str(cut), "new.mcap") == 0
-    assert capsys.readouterr().err == ""
-    with (here / "new.mcap").open("rb") as stream:
-        summary = make_reader(stream).get_summary()
-    assert summary is not None
 
 
 # calibrate
@@ -192,18 +171,6 @@ def test_the_numbers_of_the_file_are_those_of_the_recording(
     assert (end["x"][0], end["y"][0]) == pytest.approx(ends_at(), abs=1e-5)
     assert re.search(r"The robot drove 1\.87 m in 5\.1 s of 7\.9 s, at most 0\.5\d m/s\.", text)
     assert "(by unnamed (native))" in text
-
-
-def test_an_old_report_is_replaced_only_by_a_complete_new_one(tmp_path: Path) -> None:
-    new = tmp_path / "here.html"
-    new.write_text("mine")
-    assert report(QUIET, new, "--force", "--from", "2000-01-01", "--to", "+1s")[0] == 1
-    assert new.read_text() == "mine"
-    before = new.stat().st_ino
-    assert report(QUIET, new, "--force")[0] == 0
-    # A new file replaces the old one; the old one is not overwritten.
-    assert new.stat().st_ino != before
-    assert [*tmp_path.iterdir()] == [new]
 
 
 def test_a_damaged_place_is_left_out_and_named(tmp_path: Path) -> None:

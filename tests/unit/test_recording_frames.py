@@ -1,4 +1,4 @@
-"""Tests of the file of frames: what is written is read, and damage costs its frame."""
+"""The file of frames: what is written is read, damage costs its frame, a time is found."""
 
 from __future__ import annotations
 
@@ -15,24 +15,11 @@ import zstandard
 from acsard.core.values import NS_PER_S, Instant, Request
 from acsard.host.errors import RecordingError
 from acsard.recording import file as recording_file
-from acsard.recording.file import (
-    MAGIC,
-    SUFFIX,
-    Failure,
-    FrameWriter,
-    Head,
-    Recording,
-    encode_steps,
-    listed,
-)
-from acsard.recording.recorded_steps import FinishedStep, RecordedStep
-from tests.each import each
+from acsard.recording.file import MAGIC, SUFFIX, FrameWriter, Head, Recording, encode_steps, listed
+from acsard.recording.recorded_steps import FinishedStep
 from tests.unit.drives import drive
 
-Taken = list[FinishedStep]
-
 TAKEN = drive().taken
-
 SECOND = 200  # steps in a record of these tests
 
 
@@ -40,27 +27,16 @@ def head(number: int, at: Instant) -> Head:
     return Head("0.2.0", "acsar", number, at.mono_ns, at.wall_ns, "[robot]\n", b"state")
 
 
-def write(taken: Taken, seconds_per_frame: int = 2, ends: list[int] | None = None) -> bytes:
-    """Return the content of a file with these steps. `ends` gets the end of each second."""
+def write(taken: list[FinishedStep], ends: list[int] | None = None) -> bytes:
+    """Return a file with two seconds in a frame. `ends` gets the end of each second."""
     file = io.BytesIO()
     frames = FrameWriter(file)
     for count, at in enumerate(range(0, len(taken), SECOND)):
-        if count % seconds_per_frame == 0:
+        if count % 2 == 0:
             frames.begin(head(at, taken[at].now))
         frames.add(encode_steps(at, taken[at : at + SECOND]))
         if ends is not None:
             ends.append(file.tell())
-    frames.end()
-    return file.getvalue()
-
-
-def content(*records: Any) -> bytes:
-    """Return a file with one frame of these records, of another version."""
-    file = io.BytesIO()
-    frames = FrameWriter(file)
-    frames.begin(records[0])
-    for record in records[1:]:
-        frames.add(record)
     frames.end()
     return file.getvalue()
 
@@ -96,10 +72,13 @@ def test_every_step_is_read_as_it_was_written(tmp_path: Path) -> None:
     assert recording.head() == head(0, TAKEN[0].now)
 
 
+# damage
+
+
 def test_a_file_that_was_cut_off_at_any_byte_has_every_complete_second(tmp_path: Path) -> None:
     ends: list[int] = []
-    data = write(TAKEN, ends=ends)
-    for cut in range(0, len(data), len(data) // 50):
+    data = write(TAKEN, ends)
+    for cut in (*range(6), *range(0, len(data), len(data) // 50)):
         numbers, recording = read(tmp_path / "a", data[:cut])
         complete = sum(end <= cut for end in ends)
         assert numbers == list(range(min(complete * SECOND, len(TAKEN)))), cut
@@ -124,132 +103,86 @@ def test_damage_costs_the_rest_of_its_frame_and_is_said(tmp_path: Path) -> None:
 def test_a_damaged_length_costs_only_its_frame(tmp_path: Path) -> None:
     """The second frame seems to have a block that reaches beyond the end of the file."""
     data = bytearray(write(TAKEN))
-    starts = frames_in(bytes(data))
-    block = starts[1] + len(MAGIC) + 2
+    block = frames_in(bytes(data))[1] + len(MAGIC) + 2
     data[block : block + 3] = (131_000 << 3 | 2 << 1).to_bytes(3, "little")
-    assert len(data) < 131_000
     numbers, recording = read(tmp_path / "a", bytes(data))
     assert numbers == [n for n in range(len(TAKEN)) if not 2 * SECOND <= n < 4 * SECOND]
     assert len(recording.damage) == 1
 
 
-def test_a_missing_frame_is_a_gap_in_the_numbers(tmp_path: Path) -> None:
-    data = write(TAKEN)
-    first, second, third = frames_in(data)[:3]
-    numbers, recording = read(tmp_path / "a", data[first:second] + data[third:])
-    assert numbers[: 2 * SECOND] == list(range(2 * SECOND))
-    assert numbers[2 * SECOND] == 4 * SECOND
-    assert recording.damage == []
-
-
-@each("content", [b"no recording", b"\x1f\x8b\x08", b"\x89MCAP0\r\n"])
-def test_another_file_is_refused_in_words(content: bytes, tmp_path: Path) -> None:
-    path = tmp_path / "a"
-    path.write_bytes(content)
-    with pytest.raises(RecordingError, match="not a recording of acsard"):
-        list(Recording([path]).records())
-
-
-@each("content", [b"", MAGIC[:3], MAGIC])
-def test_a_file_that_was_cut_off_before_its_first_second_has_no_steps(
-    content: bytes, tmp_path: Path
-) -> None:
-    assert read(tmp_path / "a", content)[0] == []
-
-
-def test_a_missing_file_a_directory_and_a_pipe_are_refused_in_words(tmp_path: Path) -> None:
+def test_a_file_that_is_no_recording_is_refused_in_words(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "pipe")
     for path in (tmp_path / "missing", tmp_path, tmp_path / "pipe"):
         with pytest.raises(RecordingError, match="cannot read"):
             list(Recording([path]).records())
-
-
-def test_a_file_larger_than_any_recording_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "a"
-    with path.open("wb") as file:
-        file.truncate(recording_file.MAX_FILE_BYTES + 1)
+    for content in (b"no recording", b"\x1f\x8b\x08", b"\x89MCAP0\r\n"):
+        with pytest.raises(RecordingError, match="not a recording of acsard"):
+            read(path, content)
+    os.truncate(path, recording_file.MAX_FILE_BYTES + 1)
     with pytest.raises(RecordingError, match="more than 256 MB"):
         list(Recording([path]).records())
 
 
-def test_a_frame_that_would_need_much_memory_is_refused(tmp_path: Path) -> None:
+def test_a_frame_that_would_need_much_memory_is_left_out(tmp_path: Path) -> None:
     """The window is bounded, and so is a record: 16 MB of zeros take 700 bytes of a file."""
     wide = zstandard.ZstdCompressionParameters.from_level(3, window_log=27)
-    frames = [
-        zstandard.ZstdCompressor(compression_params=wide).compressobj(),
-        zstandard.ZstdCompressor(level=3).compressobj(),
-    ]
-    contents = [b"\0\0\0\1" + bytes(1 << 20), b"\xff\xff\xff\xff\0\0\0\0" + bytes(1 << 25)]
-    for frame, content in zip(frames, contents, strict=True):
-        path = tmp_path / "a"
-        path.write_bytes(frame.compress(content) + frame.flush())
-        recording = Recording([path])
-        assert list(recording.records()) == []
+    for compressor, content in (
+        (zstandard.ZstdCompressor(compression_params=wide), b"\0\0\0\1" + bytes(1 << 20)),
+        (zstandard.ZstdCompressor(level=3), b"\xff\xff\xff\xff\0\0\0\0" + bytes(1 << 25)),
+    ):
+        frame = compressor.compressobj()
+        numbers, recording = read(tmp_path / "a", frame.compress(content) + frame.flush())
         (damage,) = recording.damage
+        assert numbers == []
         assert "memory" in str(damage) or "record has" in str(damage)
 
 
-def test_a_newer_version_may_add_fields_and_services(tmp_path: Path) -> None:
+# other versions
+
+
+def test_a_newer_version_may_add_fields_and_services_and_an_older_one_lack_them(
+    tmp_path: Path,
+) -> None:
+    def step_of(*records: Any) -> Any:
+        file = io.BytesIO()
+        frames = FrameWriter(file)
+        frames.begin(records[0])
+        frames.add(records[1])
+        frames.end()
+        (tmp_path / "a").write_bytes(file.getvalue())
+        recording = Recording([tmp_path / "a"])
+        (step,) = recording.steps()
+        assert recording.damage == []
+        return step
+
     row = msgspec.to_builtins(encode_steps(0, TAKEN[:1]).rows[0], builtin_types=(bytes,))
     row[3] |= {"added": 1, "requests": [{"verb": "dance"}, {"verb": "stop", "loudly": True}]}
-    beginning = msgspec.to_builtins(head(0, Instant(0, 0)), builtin_types=(bytes,))
+    begin = msgspec.to_builtins(head(0, Instant(0, 0)), builtin_types=(bytes,))
     steps = {"type": "steps", "first": 0, "rows": [[*row, "added"]], "checksum": 0, "added": {}}
-    path = tmp_path / "a"
-    path.write_bytes(content({**beginning, "added": [1]}, steps))
-    recording = Recording([path])
-    (step,) = recording.steps()
-    assert recording.damage == []
-    assert step.heard.requests == (Request("stop"),)
-
-
-def test_an_older_version_may_lack_fields(tmp_path: Path) -> None:
+    assert step_of(begin | {"added": [1]}, steps).heard.requests == (Request("stop"),)
     status = {"mode": "ready", "code": "no_command", "reason": "why", "link": "up"}
     rows = [[5, 7, [], {"port_open": True}, True, None, None, "", 0, status, [], []]]
     begin = {"type": "head", "version": "0.2.0", "robot": "r", "number": 0, "mono_ns": 0}
-    path = tmp_path / "a"
-    steps = {"type": "steps", "first": 0, "rows": rows, "checksum": 0}
-    path.write_bytes(content(begin | {"wall_ns": 0}, steps))
-    (step,) = Recording([path]).steps()
-    assert step.now == Instant(5, 12)
-    assert step.recorded.status.mode == "ready"
+    step = step_of(begin | {"wall_ns": 0}, steps | {"rows": rows})
+    assert (step.now, step.recorded.status.mode) == (Instant(5, 12), "ready")
 
 
-def test_the_step_in_which_the_daemon_failed_is_the_last_record(tmp_path: Path) -> None:
-    failure = Failure(0, "ZeroDivisionError: division by zero", TAKEN[0].now, TAKEN[0].heard)
-    path = tmp_path / "a"
-    path.write_bytes(content(head(0, TAKEN[0].now), failure))
-    *_, last = Recording([path]).records()
-    assert last == failure
-
-
-def numbers_between(paths: list[Path], begin_ns: int, end_ns: int) -> list[int]:
-    return [step.number for step in Recording(paths, begin_ns, end_ns).steps()]
+# parts
 
 
 def test_steps_between_two_times_are_found_over_all_files(tmp_path: Path) -> None:
-    walls = [entry.now.wall_ns for entry in TAKEN]
-    half = 2 * SECOND
+    walls, half = [entry.now.wall_ns for entry in TAKEN], 2 * SECOND
     paths = [tmp_path / "1", tmp_path / "2"]
     for path, part in zip(paths, (TAKEN[:half], TAKEN[half:]), strict=True):
-        path.write_bytes(write(part, 1))
+        path.write_bytes(write(part))
     for begin in range(0, len(TAKEN), 300):
         for end in (begin, begin + 10, begin + half, len(TAKEN) - 1):
             at = walls[begin], walls[min(end, len(walls) - 1)]
-            expected = [
-                n % half if n < half else n - half
-                for n, w in enumerate(walls)
-                if at[0] <= w <= at[1]
-            ]
-            assert numbers_between(paths, *at) == expected, (begin, end)
-
-
-def test_a_frame_outside_the_time_is_not_read(tmp_path: Path) -> None:
-    path = tmp_path / "a"
-    path.write_bytes(write(TAKEN, 1))
-    begin = TAKEN[2 * SECOND + 50].now.wall_ns
-    records = list(Recording([path], begin, begin + 1).records())
-    assert [r.number for r in records if isinstance(r, Head)] == [2 * SECOND]
-    assert sum(isinstance(r, RecordedStep) for r in records) == SECOND
+            expected = [n % half if n < half else n - half for n, w in enumerate(walls)
+                        if at[0] <= w <= at[1]]  # fmt: skip
+            found = [step.number for step in Recording(paths, *at).steps()]
+            assert found == expected, (begin, end)
 
 
 def test_a_file_that_ended_before_the_time_is_not_read(tmp_path: Path) -> None:
@@ -260,7 +193,7 @@ def test_a_file_that_ended_before_the_time_is_not_read(tmp_path: Path) -> None:
     assert list(Recording([path], last + 2 * NS_PER_S).records()) == []
     # A copy, by another clock.
     os.utime(path, ns=(0, 0))
-    assert numbers_between([path], last, last) == [len(TAKEN) - 1]
+    assert [step.number for step in Recording([path], last, last).steps()] == [len(TAKEN) - 1]
 
 
 def test_the_files_of_a_directory_are_ordered_by_their_numbers(tmp_path: Path) -> None:
@@ -270,8 +203,5 @@ def test_the_files_of_a_directory_are_ordered_by_their_numbers(tmp_path: Path) -
     (tmp_path / "000001-20261129T000000Z.mcap").touch()
     os.mkfifo(tmp_path / f"000002-x{SUFFIX}")
     (tmp_path / f"000003-x{SUFFIX}").symlink_to(tmp_path / "11")
-    assert [path.name.removesuffix(SUFFIX) for path in listed(tmp_path)] == [
-        names[1],
-        names[0],
-        names[2],
-    ]
+    found = [path.name.removesuffix(SUFFIX) for path in listed(tmp_path)]
+    assert found == [names[1], names[0], names[2]]

@@ -7,8 +7,6 @@ from __future__ import annotations
 
 import random
 import re
-import time
-from collections.abc import Callable
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -21,7 +19,6 @@ from msgspec.structs import replace
 from acsard.core.config.settings import Config
 from acsard.core.guard import Memory
 from acsard.core.robot import Robot
-from acsard.host.errors import RecordingError
 from acsard.recording.file import Recording
 from acsard.recording.replay import Playback
 from acsard.recording.state import (
@@ -29,15 +26,13 @@ from acsard.recording.state import (
     LAYOUT,
     MAX_BYTES,
     PARTS,
-    Frozen,
     StateError,
     freeze,
     thaw,
 )
 from tests.each import each
-from tests.scenarios.taped import BATCH, Tape
+from tests.scenarios.taped import Tape
 from tests.scenarios.world import World
-from tests.unit.drives import drive
 
 PLAIN = Config()
 
@@ -69,36 +64,6 @@ def test_a_robot_is_read_back_unchanged(config: Config) -> None:
     assert freeze(*state) == freeze(*thaw(data, config)) == data
     errors = [column for column in state.robot._odometry.uncertainty.columns if any(column)]
     assert len(errors) >= 3 or config == PLAIN
-
-
-@pytest.mark.parametrize("end", [0, 1000])
-def test_a_state_that_was_cut_is_refused(end: int) -> None:
-    with pytest.raises(StateError):
-        thaw(driven()[:end])
-
-
-@each(
-    "state",
-    [
-        b"\x91" * 100_000,  # arrays in arrays
-        b"\x81" * 100_000,  # maps in maps
-        b"\xdd\xff\xff\xff\xff",  # an array of 4e9 values
-        b"\xdf\xff\xff\xff\xff",  # a map of 4e9 values
-        b"\xc6\xff\xff\xff\xff",  # 4 GB of bytes
-        b"\xc9\xff\xff\xff\xff\x01",  # an extension of 4 GB
-        b"\xc1",  # no type
-    ],
-)
-@each("part", [*PARTS, None])
-def test_a_forged_part_is_refused_at_once(part: str | None, state: bytes) -> None:
-    frozen = msgspec.msgpack.decode(driven(), type=Frozen)
-    if part is not None:
-        frozen.parts[part] = msgspec.Raw(state)
-        state = msgspec.msgpack.encode(frozen)
-    began = time.thread_time()
-    with pytest.raises(StateError):
-        thaw(state)
-    assert time.thread_time() - began < 0.5
 
 
 def test_a_state_above_a_megabyte_is_refused_unread() -> None:
@@ -172,42 +137,6 @@ def test_a_state_with_a_configuration_that_a_file_may_not_have_is_refused() -> N
     robot.config = replace(PLAIN, limits=replace(PLAIN.limits, linear_deceleration=0.11))
     with pytest.raises(StateError, match=r"limits\.linear_deceleration = 0\.11"):
         thaw(freeze(robot, Memory()))
-
-
-SPOILERS: dict[str, Callable[[Robot], None]] = {
-    "a number for the session": lambda robot: setattr(robot, "session", 5),
-    "no memory of commands": lambda robot: setattr(robot.session._echo, "sent", 5),
-    "no encoders": lambda robot: setattr(robot.session.count_recovery, "wheels", ()),
-    "words for a time": lambda robot: setattr(robot._last, "left_ns", "now"),
-    "a list for a counter": lambda robot: setattr(robot, "counters", []),
-    "no wheels": lambda robot: setattr(robot._checks.wheels, "wheels", ()),
-}
-
-
-@pytest.mark.parametrize("how", SPOILERS)
-def test_a_robot_with_a_wrong_part_is_refused_with_a_message(how: str, tmp_path: Path) -> None:
-    tape, first = Tape(), BATCH
-    robot, memory = thaw(drive().states[first])
-    SPOILERS[how](robot)
-    tape.taken, tape.states = drive().taken, {first: freeze(robot, memory)}
-    path = tape.save(tmp_path / "spoilt", first=first)
-    with pytest.raises(RecordingError, match=r"this acsard cannot replay spoilt, which acsard "):
-        list(Playback(Recording([path])).steps())
-
-
-def test_configured_values_change_and_values_of_the_drive_stay() -> None:
-    other = replace(
-        PLAIN,
-        drive=replace(PLAIN.drive, wheel_radius=0.1),
-        limits=replace(PLAIN.limits, linear_speed=0.25),
-    )
-    before = thaw(driven()).robot
-    robot = thaw(driven(), other).robot
-    assert robot.snapshot(0).pose == before.snapshot(0).pose
-    assert robot.counters == before.counters
-    assert robot.session.link == "up"
-    assert vars(robot._kinematics) == vars(Robot(other)._kinematics)
-    assert robot._kinematics is robot._errors.kinematics
 
 
 def test_a_robot_of_another_layout_is_replaced_by_a_fresh_one_where_it_rests(

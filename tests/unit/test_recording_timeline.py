@@ -14,7 +14,7 @@ import pytest
 from msgspec.structs import replace
 
 from acsard.core.config.parsing import effective
-from acsard.core.config.settings import Config, McuConfig
+from acsard.core.config.settings import Config
 from acsard.core.config.toml_text import document
 from acsard.core.ros.shapes import Log
 from acsard.core.values import NS_PER_S
@@ -24,8 +24,6 @@ from acsard.recording.timeline import Timeline, TimelineEntry
 from tests.scenarios.taped import Tape, recorded_world
 from tests.scenarios.world import START
 from tests.unit.drives import CONFIG, drive
-
-BOARD = Config(mcu=McuConfig(port="/dev/ttyACM0"))
 
 
 def head(number: int = 0, started_ns: int = 0) -> Head:
@@ -95,17 +93,6 @@ def test_a_run_that_ends_without_a_shutdown_is_reported_before_the_next_start() 
     assert entries[cut].wall_ns == steps[-1].now.wall_ns
 
 
-def test_a_run_that_ends_with_its_shutdown_was_not_cut() -> None:
-    tape, world = recorded_world()
-    world.drive(0.5, seconds=0.5)
-    world.loop.shutting_down = True
-    world.run(0.7)
-    steps = tape.steps()
-    names = [entry.name for entry in entries_of(head(), *steps, head(started_ns=1), *steps)]
-    assert "cut" not in names
-    assert names.count("start") == 2
-
-
 def test_a_failure_of_the_daemon_is_reported() -> None:
     steps = drive().steps()
     last = entries_of(head(), *steps, Failure(len(steps), "ValueError: seven"))[-1]
@@ -147,16 +134,6 @@ def test_reasons_that_alternate_in_every_step_make_an_entry_a_second() -> None:
     assert len(texts(entries_of(head(), *steps), "reason")) == pytest.approx(seconds, abs=1)
 
 
-def test_a_link_that_is_lost_has_the_reason_of_its_event_only() -> None:
-    tape, world = recorded_world(BOARD)
-    world.drive(0.5, seconds=1.0)
-    world.mcu.reset(world.now_ns, 300_000_000)
-    world.run(0.9)
-    entries = story(tape)
-    assert texts(entries, "link_stale")
-    assert texts(entries, "reason") == []
-
-
 def test_a_source_that_waits_has_an_entry_once_in_a_drive() -> None:
     steps = drive().steps()
     waits = Waits(steps[100].now, {"nav": ("source_priority", "app has priority")})
@@ -179,28 +156,6 @@ def messages(config: Config = CONFIG) -> list[Published]:
 
 def names(published: list[Published]) -> set[str]:
     return {message.channel.name for message in published}
-
-
-def test_a_transform_that_is_switched_off_is_not_published() -> None:
-    quiet = replace(
-        CONFIG,
-        odometry=replace(CONFIG.odometry, publish_tf=False),
-        lidar=replace(CONFIG.lidar, publish_tf=False),
-    )
-    assert names(messages()) - names(messages(quiet)) == {
-        "tf",
-        "tf_static",
-    }
-
-
-def test_other_parameters_change_the_pose_but_not_the_received_commands() -> None:
-    wider = replace(CONFIG, drive=replace(CONFIG.drive, wheel_separation=0.6))
-    then, now = messages(), messages(wider)
-    (last, other) = ([m for m in run if m.channel.name == "odom"][-1] for run in (then, now))
-    turned, less = (m.message.pose.pose.orientation.z for m in (last, other))
-    assert 0.3 < less / turned < 0.7
-    commands = [[m for m in run if m.channel.name.startswith("cmd_vel_in")] for run in (then, now)]
-    assert commands[0] == commands[1] != []
 
 
 def logs(messages: list[Published]) -> list[Log]:

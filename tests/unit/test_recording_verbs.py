@@ -114,13 +114,6 @@ def test_the_newest_recording_or_all_of_a_range_are_shown(where: Path) -> None:
     assert [entry for entry in entries(whole) if entry[0] >= found[1][0]] == found[1:]
 
 
-def test_a_part_of_one_recording_is_shown_by_its_number_and_by_its_path(where: Path) -> None:
-    whole, by_path = log(where, "show", "2"), log(where, "show", str(where / name(2)))
-    assert whole == by_path
-    part = log(where, "show", "2", "--from", local(1.0), "--to", "+0.3s")
-    assert 0 < len(part[1].splitlines()) < len(whole[1].splitlines())
-
-
 @pytest.mark.parametrize("verb", ENDINGS)
 def test_a_time_without_a_recording_is_refused(verb: str, where: Path, tmp_path: Path) -> None:
     new = [str(where / name(1)), str(tmp_path / "new")] if ENDINGS[verb] else []
