@@ -33,6 +33,7 @@ QUESTIONS = {
     "What happened at 14:05?": ("howto/what-happened.md", "show --from 14:05"),
     "How do I let a phone drive?": ("howto/phone.md", "invite operator"),
     "Why can `ros2 topic pub` not drive?": ("howto/ros-drive.md", "it sends no zero"),
+    "How do I stop all robots?": ("howto/fleet-all.md", "acsard call stop --id"),
     "How do I let a laptop in?": ("howto/access.md", "tls init"),
     "Which role may clear a stop?": ("reference/keys.md", "| operator | all of viewer"),
     "How do I change a setting for good?": ("howto/settings.md", "--keep"),

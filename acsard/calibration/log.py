@@ -60,8 +60,8 @@ MAX_SIDE_DIFFERENCE = 0.8  # of front and rear wheel, as a share of the rolled a
 
 ADVICE = (
     "write a CSV file with commas, decimal points and SI units, whose first line names the columns "
-    'like "t,left,right,yaw_rate" or "t,fr,fl,rl,rr,x,y" (deploy/calibration/README.md explains '
-    "the columns, and bag_to_csv.py there converts a ROS bag)"
+    'like "t,left,right,yaw_rate" or "t,fr,fl,rl,rr,x,y" (page reference/csv of the manual explains'
+    " the columns, and page howto/bag how to convert a ROS bag)"
 )
 
 

@@ -98,7 +98,7 @@ def _add_router(actions: argparse._SubParsersAction[argparse.ArgumentParser]) ->
         help="print the configuration of a fleet's router",
         description="Print router.json5 for `acsard router` or zenohd. This file says what each "
         "robot and each person's certificate may do. The steps to set up the router are in "
-        "deploy/zenoh/README.md.",
+        "page howto/fleet of the manual.",
     )
     router.add_argument("robots", nargs="+", metavar="ROBOT", help="ids of the robots")
     for role in ROLES:

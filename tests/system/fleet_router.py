@@ -107,7 +107,7 @@ def write_local_copy(file: Path, where: Path, endpoint: str) -> Path:
 def robot_at(endpoint: str, where: Path, robot_id: str, mode: str = "client", **how: Any) -> Daemon:
     """Return a daemon with robot.toml and the certificate of its id. `how` goes to `Daemon`.
 
-    As a Zenoh peer it also serves the programs on its own machine, as README.md describes.
+    As a Zenoh peer it also serves the programs on its own machine, as the manual describes.
     """
     tables = tomllib.loads(ROBOT_FILE.read_text())
     tables["robot"]["id"] = robot_id
@@ -183,7 +183,7 @@ class Fleet:
             robot.linked()
 
     def config(self, name: str) -> zenoh.Config:
-        """Return README.md's settings for all languages, with this certificate."""
+        """Return the manual's settings for all languages, with this certificate."""
         config = client_config(self.endpoint)
         config.insert_json5("transport/link/tls", json.dumps(tls_settings(self.where / name)))
         return config

@@ -108,7 +108,9 @@ def test_the_flash_of_the_firmware_page_calls_avrdude_with_its_port() -> None:
 def test_one_authority_and_one_file_serve_the_ten_robots_of_the_fleet_page(tmp_path: Path) -> None:
     place = with_acsard(tmp_path)
     for part in ("tls init", "tls add router", "tls add robot$n", "tls add laptop", "tls router"):
-        command = find("deploy/zenoh/README.md", part).replace("192.168.1.10", "127.0.0.1")
+        command = find("deploy/manual/pages/howto/fleet.md", part).replace(
+            "192.168.1.10", "127.0.0.1"
+        )
         done = shell(place, command)
         assert done.code == 0, done
     clients, endpoint = place / "fleet/clients", free_tls_endpoint()

@@ -108,7 +108,7 @@ def test_one_message_with_the_stamp_0_is_left_out(
 
 
 def test_the_command_of_the_page_converts_a_bag(tmp_path: Path) -> None:
-    page = (SCRIPT.parent / "README.md").read_text()
+    page = (SCRIPT.parents[1] / "manual/pages/howto/bag.md").read_text()
     name = f"$ python3 {SCRIPT.name} "
     (command,) = (line for line in page.splitlines() if line.startswith(name))
 

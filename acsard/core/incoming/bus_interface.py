@@ -118,7 +118,7 @@ class GatewayFollower:
 PEER_ADVICE = (
     "A peer, such as a robot's daemon, does not forward messages, so a client of one robot sees "
     "only that robot, and `acsard call stop --id '*'` stops only that robot; put a router between "
-    "the robots (deploy/zenoh/README.md)"
+    "the robots (page howto/fleet of the manual)"
 )
 
 

@@ -340,7 +340,7 @@ def _routers(endpoints: Sequence[str], routers: RoutersStatus) -> list[Row]:
             "daemon then connects by itself"
         )
     if peers:
-        advice = "connect all robots to a Zenoh router (deploy/zenoh/README.md)"
+        advice = "connect all robots to a Zenoh router (page howto/fleet of the manual)"
         words += (
             f"; {', '.join(peers)} is not a router: clients that connect to this daemon see only "
             "this robot"
