@@ -16,6 +16,7 @@ from acsard.checkup import motion, outcomes
 from acsard.checkup.findings import StoppedError, WireLostError, motor_name, motor_names
 from acsard.checkup.lateness import HostDelays
 from acsard.checkup.motion import ZERO, BoardReply
+from acsard.checkup.repeats import Repeats
 from acsard.checkup.restarts import RestartedError, Restarts
 from acsard.core.config.settings import McuConfig, WheelMap
 from acsard.core.config.wire_time import line_bytes, wire_ns
@@ -96,8 +97,9 @@ class Board:
     it sends nothing, so that the board's watchdog can stop the motor.
     """
 
-    def __init__(self, wire: Wire, mcu: McuConfig, rate_hz: float) -> None:
+    def __init__(self, wire: Wire, mcu: McuConfig, rate_hz: float, encoders: bool = True) -> None:
         self.wire, self.mcu, self.rate_hz = wire, mcu, rate_hz
+        self.repeats = Repeats(encoders)
         # Whether the check has seen all motors stand still. From then on, the check ends if a motor
         # runs away or if the board falls silent.
         self.armed = False
@@ -125,6 +127,8 @@ class Board:
         self.replies: list[BoardReply] = []
         # Received lines that are neither valid replies nor status lines.
         self.unrecognized_lines: list[bytes] = []
+        # Valid replies in a row: the last ones, and the most.
+        self.good_run = self.longest_run = 0
         # Maps the number of each input to whether the board last reported it as pressed.
         self.inputs: dict[int, bool] = {}
         # Statistics of all bytes and lines received since the last call of `open`.
@@ -355,6 +359,8 @@ class Board:
                 at_s = (at_ns - wire_ns(following, self.baud_rate)) / NS_PER_S
                 reply = self._reply(line, at_s)
                 self.heard.line(line, reply is not None)
+                self.good_run = self.good_run + 1 if reply is not None else 0
+                self.longest_run = max(self.longest_run, self.good_run)
                 if restart := self.restarts.check_line(line, at_s, reply):
                     raise RestartedError(restart)
                 if reply is not None:

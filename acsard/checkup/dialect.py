@@ -16,7 +16,10 @@ from acsard.checkup.findings import Finding, StoppedError, motor_name
 from acsard.checkup.motion import BOOT_S, SHORT_MEASUREMENT_S, WATCHDOG_SILENCE_S, ZERO, BoardReply
 from acsard.core.config.settings import MAX_REPLY_PERIOD_S, Baud
 from acsard.core.config.wire_time import COMFORTABLE_USE, highest_rate, line_bytes
+from acsard.core.formatting import printable_bytes
 from acsard.core.link.checked_line import seal
+from acsard.core.link.link_diagnosis import MAX_SHOWN_BYTES, is_text
+from acsard.core.link.link_state import GOOD_LINES
 from acsard.core.link.session import IDENTITY
 
 
@@ -130,6 +133,17 @@ def _comma_wrong(board: Board, how: str) -> Finding:
 
 def replies(board: Board) -> Finding:
     """Compare the replies with the documented form; the daemon can read other forms too."""
+    texts = [line for line in board.unrecognized_lines if is_text(line) and line[:1] != b"!"]
+    if texts:
+        return outcomes.find(
+            "reply form: text"
+            if board.longest_run >= GOOD_LINES
+            else "reply form: only text between",
+            text=printable_bytes(texts[-1], MAX_SHOWN_BYTES),
+            texts=len(texts),
+            lines=len(texts) + len(board.replies),
+            least=GOOD_LINES,
+        )
     lines = [reply.line.partition(b"#")[0] for reply in board.replies]
     forms = {"spaces": rb", ", "unpadded": rb"[pn]\d\.", "trailing comma": rb", *\Z"}
     names = [name for name, sign in forms.items() if any(re.search(sign, line) for line in lines)]

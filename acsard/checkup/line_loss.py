@@ -17,7 +17,7 @@ from acsard.checkup.findings import Finding, StoppedError
 from acsard.checkup.motion import ZERO, BoardReply
 from acsard.core.config.wire_time import COMFORTABLE_USE, highest_rate, line_bytes
 from acsard.core.formatting import printable_bytes
-from acsard.core.link.link_diagnosis import MAX_SHOWN_BYTES
+from acsard.core.link.link_diagnosis import MAX_SHOWN_BYTES, is_text
 from acsard.core.link.session import IDENTITY
 
 # Largest fraction of lost lines that the check accepts. A good link loses no line.
@@ -98,7 +98,10 @@ def _period_s(board: Board) -> float:
 
 
 def _counted(board: Board, began_s: float, lines: int, others: int) -> Count:
-    damaged = sum(not line.startswith(IDENTITY) for line in board.unrecognized_lines[others:])
+    damaged = sum(
+        not (line.startswith(IDENTITY) or is_text(line))
+        for line in board.unrecognized_lines[others:]
+    )
     replies = motion.since(board.replies, began_s)
     if not board.own_clock:
         return Count(lines, max(damaged, lines - len(replies)), damaged)

@@ -23,6 +23,14 @@ FAIL baud rate: received_nothing | nothing received
     {heard} at {configured} baud, and no good line at any other rate
     -> is this the right port (`acsard ports`), does the board have power, does its firmware answer,
     are TX and RX swapped?
+FAIL baud rate: received_text | text instead of replies
+    at {configured} baud {heard}; no good line at any other rate
+    -> the baud rate is right, but the firmware prints other text: remove its Serial.print, and let
+    it answer each line
+FAIL baud rate: received_form | replies in another form
+    at {configured} baud {heard}; no good line at any other rate
+    -> the lines are whole, but the firmware must send `ap00.00,bp00.00,cp00.00,dp00.00`: p or n as
+    the sign, and two digits, a point and two digits in each figure, without spaces
 FAIL baud rate: received_cut | pieces of lines
     at {configured} baud {heard}; no good line at any other rate
     -> the firmware cuts its replies short or omits the line end: it must send all four values and
@@ -60,6 +68,22 @@ PASS reply form: right | as documented
 WARN reply form: other | {forms}
     replies look like {line!r}; the daemon reads them
     -> nothing to do; `ap00.00,bp00.00,cp00.00,dp00.00` is shorter on the wire, and unambiguous
+WARN reply form: text | also text
+    the firmware also prints text, such as `{text}`: {texts} of {lines} lines
+    -> remove its Serial.print, because such lines delay the replies
+FAIL reply form: only text between | also text
+    the firmware prints text between its replies, such as `{text}`: {texts} of {lines} lines. The
+    daemon drives only after {least} replies in a row
+    -> remove its Serial.print
+FAIL replies: echo | each command comes back
+    the board sends each command back, then its reply follows: the daemon takes the command for the
+    measured speeds, and does not drive
+    -> remove the echo from the firmware
+FAIL replies: set points | no measured speeds
+    the board reports exactly the commanded speeds from the first line on, so these are not
+    measurements: nothing would show a motor that does not turn, and the daemon does not drive
+    -> let the firmware report the speeds of the encoders, or write feedback.encoders = false if the
+    robot has none
 
 PASS? reply rate: right | {rate:.0f} Hz, {way}
     longest gap {longest:.0f} ms
@@ -169,6 +193,10 @@ FAIL? motor: several | {shown}
 FAIL? motor: one way | {figure}
     motor {here} shows movement in one direction only
     -> check the direction output of {here}'s driver, and A and B of its encoder
+FAIL? motor: no sign | {figure}
+    encoder {here} reports the same direction when motor {here} turns forward and backward
+    -> is one of the two channels A and B of encoder {here} missing, or does the firmware lose the
+    sign?
 FAIL? motor: size | {figure}
     encoder {here} is more than {tolerance:.0%} off the commanded {speed:g} rad/s: every distance
     would be wrong by as much
@@ -190,6 +218,10 @@ FAIL trailing comma: latched | {figure}
     without the last comma this wheel keeps its old speed
     -> write mcu.trailing_comma = {comma}; the check goes on with it
 
+WARN measured speeds: set points | none
+    the board reports the commanded speeds, as feedback.encoders = false says: the rows above do not
+    show whether the motors turn
+    -> watch each wheel while its motor turns
 SKIPPED wheel map: not seen
     no person watched: the check assumes the configured wheel and direction of each motor
 PASS wheel map: right | {map}

@@ -32,6 +32,7 @@ from acsard.checkup.restarts import Restart, RestartedError
 from acsard.checkup.wheels import Channel, encoder_finding, wheel_map
 from acsard.core.config.settings import Config, SafetyConfig
 from acsard.core.formatting import many
+from acsard.core.link.link_state import WATCHDOG_S
 from acsard.core.values import NS_PER_S
 
 LIFTED, QUITS = "lifted", "q"
@@ -72,7 +73,10 @@ LATE_AGAIN, LATE_MOST = 2, 8
 
 # A longer stall ends the check, because the operator may have left. The first applies until all
 # motors were seen to stand still.
-STALL_S, ZEROS_STALL_S = 0.5, 5.0
+STALL_S, ZEROS_STALL_S = 3.0, 5.0
+
+# After a shorter stall, the lines show whether the step ran too late.
+SHORT_STALL_S = 0.5
 
 # The step with restart number `AGAIN` + 1, or restart number `MOST` in all, ends the check.
 AGAIN, MOST = 1, 5
@@ -108,7 +112,7 @@ def run(
     why = ""
     all_restarts: list[Restart] = []
     try:
-        with Board(wire, config.mcu, config.rate_hz) as board:
+        with Board(wire, config.mcu, config.rate_hz, config.feedback.encoders) as board:
             board.zeros()
             if operator.ask(CONFIRMATION, (LIFTED,)) != LIFTED:
                 raise StoppedError(outcomes.find("wheels: not lifted"))
@@ -153,7 +157,7 @@ class _Watched:
         stalled_s, self._ran_s = now_s - self._ran_s, now_s
         if stalled_s > (STALL_S if self._board.armed else ZEROS_STALL_S):
             raise StoppedError(outcomes.find("stall: seen", seconds=stalled_s))
-        if stalled_s > STALL_S:
+        if stalled_s > SHORT_STALL_S:
             # `Board` measures neither the time for which the computer was suspended, nor the time
             # for which the terminal did not accept the tool's output.
             self._board.lateness.record(stalled_s, self._board.now_s)
@@ -184,6 +188,7 @@ class _Steps:
             self._take("", partial(self._turn, motor))
         channels = self._channels
         self._take("", lambda: dialect.comma(board, channels[-1].kind in ("dead", "late")))
+        self._take("", board.repeats.finding)
         self._take("", lambda: wheel_map(board.mcu, channels))
         right = [channel.motor for channel in channels if channel.kind in ("right", "off")]
         self._take("", lambda: encoder_counts.finding(board, right))
@@ -239,9 +244,9 @@ class _Steps:
                 break
             late_s = max(late_s, meanwhile_s)
             late_finding = lateness.finding(finding.name, late_s)
-            if ends and board.armed:
+            if ends and board.armed and meanwhile_s < WATCHDOG_S:
                 # The step has ended the check. So do not turn a motor again, even if the cause was
-                # only a delay of this computer.
+                # only a delay of this computer, unless that is as long as the silence of a board.
                 finding, board.saved_results = late_finding, saved
                 break
         else:

@@ -42,6 +42,11 @@ CAUSES = {"power": "supply", "brown-out": "supply", "watchdog": "watchdog", "pin
 # even if it is damaged.
 _WORD = re.compile(rb"[a-z]{3}|[G-Z]{3}")
 
+# By which the check knows a text again that the firmware prints now and then.
+KNOWN_BYTES = 12
+
+_NUMBER = re.compile(rb"[0-9]+")
+
 _CAUSE = re.compile(rb" reset=([a-z-]{1,20})")
 
 
@@ -76,6 +81,7 @@ class Restarts:
         self._sent_s: float | None = None
         self._silent_s = 0.0  # longest time between two sent lines since the board's last reply
         self._unanswered = 0
+        self._texts: set[bytes] = set()  # beginnings of texts that came between replies
         # None before the first reply. Until then a text shows no restart: many boards boot when
         # opened.
         self._replied_s: Seconds | None = None
@@ -119,8 +125,13 @@ class Restarts:
     def _line_sign(self, line: bytes, at_s: float) -> str:
         if line.startswith(IDENTITY) and at_s - self._asked_s > ANSWER_TIMEOUT_S:
             return "the board sent its name without a request"
-        boots = self._unanswered >= RESTART_UNANSWERED_LINES and _WORD.search(line)
-        return "the board was silent, then sent a text instead of replies" if boots else ""
+        if not _WORD.search(line):
+            return ""
+        text = _NUMBER.sub(b"0", line)[:KNOWN_BYTES]
+        if self._unanswered < RESTART_UNANSWERED_LINES:
+            self._texts.add(text)
+        known = text in self._texts
+        return "" if known else "the board was silent, then sent a text instead of replies"
 
     def _clock_sign(self, reply: BoardReply) -> str:
         before, reading = self._clock, reply.reading

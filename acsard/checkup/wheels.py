@@ -35,6 +35,7 @@ Kind = Literal[
     "other",  # only the encoder of another motor moved
     "several",  # several encoders moved, or different ones forward and backward
     "one way",  # encoders moved in only one of the two directions
+    "no sign",  # its own encoder reported one direction for both
     "size",  # the error of the speed is larger than `FAIL_TOLERANCE`
     "off",  # the error of the speed is larger than `WARN_TOLERANCE`
     "late",  # this computer was too late to judge the motor
@@ -87,6 +88,8 @@ class Channel(Struct, frozen=True):
             return "other"
         if self.probed or self.forth[own] < 0 < self.back[own]:
             return "reversed"
+        if self.forth[own] * self.back[own] > 0.0:
+            return "no sign"
         if self.error > FAIL_TOLERANCE:
             return "size"
         return "off" if self.error > WARN_TOLERANCE + self.unsure else "right"
@@ -220,9 +223,14 @@ def run_up(board: Board, motors: Motors) -> Motors:
     It returns when the speeds are steady, when time is over, or earlier if no encoder moves.
     """
     steps = max(1, int(motion.SHORT_MEASUREMENT_S / board.period_s))
+    before = ZERO
     for step in range(1, steps + 1):
         a, b, c, d = (round(speed * step / steps, 2) for speed in motors)
-        board.drive((a, b, c, d), board.period_s)
+        command = a, b, c, d
+        replies = [reply.motors for reply in board.drive(command, board.period_s)]
+        board.repeats.record(replies, before, command)
+        before = command
+    board.repeats.judge()
     began_s, look_s = board.now_s, _look_s(board)
     driven = [motor for motor in range(4) if motors[motor]]
     means, looks, steady = ZERO, 0, 0

@@ -31,8 +31,8 @@ WaitCode = Literal[
 LinkCode = Literal[
     "port_closed", "port_trouble", "port_blocked", "booting", "link_up", "link_silent", "host_late",
     "simulator_fault", "echo", "set_points", "no_checksum", "replies_damaged", "lines_too_rare",
-    "reply_period", "received_nothing", "received_statuses", "received_cut", "received_foreign",
-    "received_garbage", "received_few", "received_sparse",
+    "reply_period", "received_nothing", "received_statuses", "received_text", "received_form",
+    "received_cut", "received_foreign", "received_garbage", "received_few", "received_sparse",
 ]  # fmt: skip
 
 # Why the pose may be far off although the link is up.
@@ -190,8 +190,8 @@ impossible_speeds
     the board reports impossible speeds ({cause})
 wheel_reversed
     {wheel} wheel does not obey its command: it turns the wrong way {figures}:
-    -> check the leads of its motor, the wires A and B of its encoder, and the wheel's sign in
-    mcu.wheels
+    -> check the leads of its motor, the wires A and B of its encoder (an encoder with one channel
+    has no direction), and the wheel's sign in mcu.wheels
 wheel_runaway
     {wheel} wheel does not obey its command: it rolls on, or too far {figures}:
     -> check the motor driver and the encoder
@@ -284,6 +284,14 @@ received_nothing
 received_statuses
     no link to the microcontroller: {received};
     -> is TX of this computer connected to RX of the board? `acsard mcu check` finds out more
+received_text
+    no link to the microcontroller: {received};
+    -> the firmware prints other text between its replies: remove its Serial.print or debug output
+received_form
+    no link to the microcontroller: {received};
+    -> the lines are whole, but in another form: the firmware must send
+    `ap00.00,bp00.00,cp00.00,dp00.00` with p or n as the sign, and two digits, a point and two
+    digits in each figure, without spaces
 received_cut
     no link to the microcontroller: {received};
     -> does the board cut its lines short, or omit the line ends? `acsard mcu check` finds out more

@@ -16,7 +16,15 @@ import pytest
 from acsard.checkup import inputs
 from acsard.checkup.findings import Finding
 from acsard.checkup.procedure import STEPS
-from acsard.core.config.settings import Config, McuConfig, Place, SafetyConfig, SimConfig, WheelMap
+from acsard.core.config.settings import (
+    Config,
+    FeedbackConfig,
+    McuConfig,
+    Place,
+    SafetyConfig,
+    SimConfig,
+    WheelMap,
+)
 from acsard.core.simulator import protocol
 from acsard.core.values import NS_PER_S
 from tests.each import each
@@ -104,6 +112,50 @@ BOARDS: dict[str, dict[str, tuple[str, dict[str, Any], bool]]] = {
     },
 }  # fmt: skip
 
+Habit = Callable[[bytes, bytes, int], bytes]
+"""Returns what the board sends for the last command, the usual reply, and the reply's number."""
+
+TEXT = b"[I][main] loop ok, heap 182344\r\n"
+
+HABITS: dict[str, Habit] = {
+    "plain": lambda _, reply, n: reply,
+    "LF CR": lambda _, reply, n: reply[:-2] + b"\n\r",
+    "figures with spaces": lambda _, reply, n: re.sub(rb"([pn])0", rb"\1 ", reply),
+    "text each second": lambda _, reply, n: (b"" if n % 50 else TEXT) + reply,
+    "text before each reply": lambda _, reply, n: TEXT + reply,
+    "only text": lambda _, reply, n: TEXT,
+    "an echo before the reply": lambda command, reply, n: command + reply,
+    "set points": lambda command, reply, n: command,
+    "set points, as configured": lambda command, reply, n: command,
+    "no direction": lambda _, reply, n: reply.replace(b"n", b"p"),
+}
+BOARDS["habits"] = {name: ("plain_only", {}, False) for name in HABITS}
+NO_ENCODERS = Config(feedback=FeedbackConfig(encoders=False))
+BOARDS["habits"]["set points, as configured"] = ("plain_only", {"config": NO_ENCODERS}, False)
+
+
+class Hobby(Robot):
+    """A robot whose firmware has a habit of hobbyists."""
+
+    def __init__(self, habit: Habit, *faults: str, **how: Any) -> None:
+        super().__init__(*faults, **how)
+        self._habit, self._command, self._held, self._replies = habit, b"", b"", 0
+
+    def send(self, data: bytes) -> None:
+        super().send(data)
+        commands = [line for line in data.splitlines(keepends=True) if SPEED.match(line)]
+        if commands:
+            self._command = commands[-1].strip().partition(b"#")[0] + b"\r\n"
+
+    def listen(self, until_ns: int) -> list[tuple[int, bytes]]:
+        pieces = []
+        for at_ns, data in super().listen(until_ns):
+            *replies, self._held = (self._held + data).split(b"\r\n")
+            for reply in replies:
+                pieces.append((at_ns, self._habit(self._command, reply + b"\r\n", self._replies)))
+                self._replies += 1
+        return pieces
+
 
 def lines(finding: Finding) -> Iterator[str]:
     yield f"{finding.verdict:8}{finding.name} | {finding.figure}"
@@ -119,7 +171,8 @@ def test_the_check_names_each_fault_and_nothing_else(
 ) -> None:
     text, first, passed = "", list[Finding](), set[str]()
     for name, (faults, how, person) in BOARDS[page].items():
-        robot = Robot(*faults.split(), **how)
+        habit = HABITS[name] if page == "habits" else None
+        robot = Hobby(habit, *faults.split(), **how) if habit else Robot(*faults.split(), **how)
         checked = Checked(robot, person)
         assert not checked.left_turning
         sent = [line for line in robot.sent if b"x" not in line]

@@ -120,7 +120,7 @@ def channel_of(motor: int, encoder: int, forth: float = 3.0, back: float = -3.0)
         (channel_of(0, 0, 4.0, -3.0), "size"),
         (channel_of(0, 0, 2.0, -2.0), "size"),
         (channel_of(0, 0, -3.0, 3.0), "reversed"),
-        (channel_of(0, 0, 3.0, 3.0), "size"),
+        (channel_of(0, 0, 3.0, 3.0), "no sign"),
         (channel_of(0, 0, 0.0, 0.0), "dead"),
         (channel_of(0, 0, 3.0, 0.0), "one way"),
         (channel_of(0, 2), "other"),

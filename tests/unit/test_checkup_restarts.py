@@ -193,9 +193,10 @@ def test_a_text_is_a_restart_after_a_silence_and_a_debug_print_otherwise() -> No
         restarts.record_speeds(ZERO, 0.0)
     assert restarts.check_line(TEXT, 0.1, None) is None
     restarts.record_speeds(ZERO, 0.1)
+    assert restarts.check_line(TEXT, 0.2, None) is None  # the board prints it now and then
     # a damaged line is not taken for text
     assert restarts.check_line(b"ap0\x00.00,b~p00.00#0AFFE", 0.2, None) is None
-    assert "text" in sign(restarts.check_line(TEXT, 0.2, None))
+    assert "text" in sign(restarts.check_line(b"Starting motors", 0.2, None))
 
 
 @each("start_ms", [0, 40_000, CLOCK_RANGE_MS - 5_000])

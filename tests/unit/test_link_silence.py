@@ -37,6 +37,11 @@ HEARD: dict[str, tuple[bytes, str, str]] = {
     "no end": (
         b"\xf8\x00\xe6" * 3, "garbage", r"the last bytes are `\xf8\x00\xe6\xf8\x00\xe6\xf8\x00\xe6`"
     ),
+    "text": (
+        b"[I][main] heap 182344\r\n" * 3 + STOP, "text",
+        "4 lines received, only 1 good, the last bad one is `[I][main] heap 182344`"
+    ),
+    "another form": (b"ap 0.00,bp 0.00,cp 0.00,dp 0.00\r\n", "form", "none good"),
     "some good": (
         STOP + b"ap?\r\n", "few", "2 lines received, only 1 good, the last bad one is `ap?`"
     ),

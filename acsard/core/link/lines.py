@@ -1,4 +1,6 @@
-"""Splits the bytes from the serial port into lines that end with LF or CR LF, in bounded memory.
+"""Splits the bytes from the serial port into lines that end with LF, in bounded memory.
+
+A CR before or after the LF belongs to the line end.
 
 After noise, the next LF ends the damaged line. Empty lines are dropped: the daemon starts every
 session with a bare line end, and a board that echoes may send it back.
@@ -36,8 +38,8 @@ class LineReader(Struct):
                 self.discarding = False
             elif len(line) >= MAX_LINE_BYTES:
                 self.too_long += 1
-            elif line not in (b"", b"\r"):
-                lines.append((line.removesuffix(b"\r"), following))
+            elif line := line.strip(b"\r"):
+                lines.append((line, following))
         if rest and not self.discarding:
             self.held += rest
             if len(self.held) >= MAX_LINE_BYTES:

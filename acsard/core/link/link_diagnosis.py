@@ -33,19 +33,35 @@ FIRST_DIAGNOSIS_NS = 3 * NS_PER_S  # a board that is only booting answers within
 
 MAX_SHOWN_BYTES = 64  # a complete line and some noise
 
-# statuses: only status lines. cut: pieces of valid lines, or no line ends. foreign: valid lines
-# within other bytes. garbage: nothing like a line. few: good lines, and bad ones. sparse: too few
-# lines.
+# statuses: only status lines. text, form: most bad lines are text, or replies in another form. cut:
+# pieces of valid lines, or no line ends. foreign: valid lines within other bytes. garbage: nothing
+# like a line. few: good lines, and bad ones. sparse: too few lines.
 ReceivedCode = Literal[
-    "received_nothing", "received_statuses", "received_cut", "received_foreign",
-    "received_garbage", "received_few", "received_sparse",
+    "received_nothing", "received_statuses", "received_text", "received_form", "received_cut",
+    "received_foreign", "received_garbage", "received_few", "received_sparse",
 ]  # fmt: skip
 
 CHECKED_FIRMWARE = ', does its firmware support mcu.link_check = "on" (else write "off")'
 
 _RIGHT = re.compile(TOKENS)
+_OTHER_FORM = re.compile(rb"[abcd][: =]*[pn+-]? *[0-9]*\.?[0-9]+[,; \t]*" * 4, re.IGNORECASE)
+_WORD = re.compile(rb"[A-Za-z]{3}")
+_VALUE = re.compile(rb"(?<![A-Za-z])[abcd][pn] *[0-9]+\.[0-9]")
 # Only characters that a reply can contain.
 _PIECE = re.compile(rb"[abcdpn0-9A-F., #@*\r\n]+")
+
+
+def is_text(line: bytes) -> bool:
+    """Return whether a bad line is text that the firmware prints, and no damaged reply.
+
+    Noise leaves some values of a reply whole, and makes bytes that cannot be printed.
+    """
+    return (
+        line.isascii()
+        and line.decode().isprintable()
+        and bool(_WORD.search(line) and not _VALUE.search(line))
+    )
+
 
 PORT_BLOCKED = sentence("port_blocked")
 
@@ -98,6 +114,8 @@ class Heard(Struct):
     lines: int = 0  # good and bad, without status lines
     good: int = 0
     statuses: int = 0
+    texts: int = 0  # bad lines for which `is_text` holds
+    formed: int = 0  # bad lines that are replies in another form
     last: bytes = b""  # last bad line, or incomplete bytes
     late_s: float = 0.0  # longest time in which this computer did not run the daemon
 
@@ -113,6 +131,8 @@ class Heard(Struct):
         self.good += good
         if not good:
             self.last = line
+            self.texts += is_text(line)
+            self.formed += _OTHER_FORM.fullmatch(line) is not None
 
     @property
     def code(self) -> ReceivedCode:
@@ -120,8 +140,13 @@ class Heard(Struct):
             return "received_statuses"
         if not self.size:
             return "received_nothing"
+        bad = self.lines - self.good
+        if 2 * self.texts > bad:
+            return "received_text"
+        if 2 * self.formed > bad:
+            return "received_form"
         if self.good:
-            return "received_few" if self.good < self.lines else "received_sparse"
+            return "received_few" if bad else "received_sparse"
         if self.lines and _RIGHT.search(self.last):
             return "received_foreign"
         return "received_cut" if _PIECE.fullmatch(self.last) else "received_garbage"
