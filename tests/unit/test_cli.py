@@ -21,9 +21,7 @@ from acsard.core.config.named_faults import ARGUMENTS
 from acsard.core.values import Pose
 from acsard.host import errors
 from acsard.host.errors import (
-    EXIT_TEXTS,
     Exit,
-    ExitError,
     MendableError,
     UsageError,
 )
@@ -55,24 +53,6 @@ def test_each_error_has_a_builtin_base_class_and_an_exit_code(
     assert str(error) == "it is so; mend it"
 
 
-def test_every_error_class_has_an_exit_code() -> None:
-    kinds = {kind for kind in vars(errors).values() if isinstance(kind, type)}
-    families = {kind for kind in kinds if issubclass(kind, MendableError)} - {
-        MendableError,
-        ExitError,
-    }
-    assert families == {kind for kind, _, _ in PROMISED}
-
-
-def test_the_help_names_every_code(capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit):
-        main(["--help"])
-    output = capsys.readouterr().out
-    assert all(f" {int(code)} " in output for code in Exit)
-    assert all(f"{code} {words}" in " ".join(output.split()) for code, words in EXIT_TEXTS.items())
-    assert set(EXIT_TEXTS) == set(Exit)
-
-
 def helped(known: argparse.ArgumentParser, path: str) -> Iterator[str]:
     """Yield the words of a help page and of those below, without the layout."""
     yield f"--- {path}"
@@ -94,11 +74,6 @@ def test_the_help_pages_have_the_approved_words(approved: Callable[[Path, str], 
     for name, kinds in ARGUMENTS.items():
         (word,) = [word for word in named if word.startswith(f"{name}=")]
         assert len(word.partition("=")[2].split(":")) == len(kinds)
-
-
-@each("code", list(Exit))
-def test_a_verb_may_end_with_any_code(code: Exit) -> None:
-    assert ExitError(code, "so").code is code
 
 
 @each(
@@ -140,20 +115,6 @@ def test_a_path_in_the_environment_that_is_not_utf_8_is_refused(
     assert f"the environment variable {name} is not valid UTF-8" in capsys.readouterr().err
 
 
-def test_a_current_directory_that_is_not_utf_8_is_refused(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    where = tmp_path / "\udce4"
-    where.mkdir()
-    monkeypatch.chdir(where)
-    with pytest.raises(SystemExit) as end:
-        main(["call", "--help"])
-    assert end.value.code == 0
-    capsys.readouterr()
-    assert main(["--config", "/missing"]) == Exit.USAGE
-    assert "the path of the current directory is not valid UTF-8" in capsys.readouterr().err
-
-
 # Each takes 1 to 20 ms of processor time to load.
 SLOW = {
     "acsard.bus.access", "acsard.core.incoming.queries", "acsard.core.messages.json_schema",
@@ -168,12 +129,6 @@ def test_call_loads_no_slow_library() -> None:
         [sys.executable, "-I", "-c", code], capture_output=True, text=True, check=True, timeout=60
     )
     assert SLOW & set(done.stdout.split()) == set()
-
-
-def test_a_number_of_the_range_is_taken() -> None:
-    drive = parser(["drive"]).parse_args(["drive", "--linear", "10", "--angular", "0"])
-    assert (drive.linear, drive.angular) == (10.0, 0.0)
-    assert parser(["echo"]).parse_args(["echo", "odom", "--timeout", "0.01"]).timeout == 0.01
 
 
 @pytest.fixture(name="reasons")

@@ -13,9 +13,8 @@ import pytest
 
 from acsard.cli import parser, run
 from acsard.cli.check import main
-from acsard.cli.common import OPTIONS, load, overrides, with_record_directory
+from acsard.cli.common import load, overrides, with_record_directory
 from acsard.cli.connection import require_readable, robot_address
-from acsard.cli.run import options
 from acsard.client.connection import open_connection
 from acsard.core.config.parsing import from_builtins, parse
 from acsard.core.config.settings import Config, McuConfig, WebConfig
@@ -54,10 +53,6 @@ def _places(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Places:
     monkeypatch.delenv("ACSARD_CONFIG", raising=False)
     monkeypatch.setattr(config_file, "SEARCH_PATHS", (SEARCH_PATHS[0], places.etc))
     return places
-
-
-def test_the_file_is_searched_in_the_working_directory_and_in_etc() -> None:
-    assert [str(place) for place in SEARCH_PATHS] == ["acsard.toml", "/etc/acsard/acsard.toml"]
 
 
 @pytest.mark.parametrize(
@@ -104,19 +99,6 @@ def test_a_named_file_that_is_missing_is_an_error_and_never_replaced(
         find(None)
 
 
-def test_a_good_file_is_decoded_with_the_command_line_on_top(places: Places) -> None:
-    places.option.write_text('[robot]\nid = "r1"\n[mcu]\nport = "/dev/a"\n')
-    where, config = load(str(places.option), {"robot.id": "r2"})
-    assert where == str(places.option)
-    assert (config.robot.id, config.mcu.port) == ("r2", "/dev/a")
-
-
-def test_every_key_that_run_can_set_has_the_name_of_its_option() -> None:
-    known = parser(["run"])
-    for key in options(known.parse_args(["run"])):
-        assert known.parse_args(["run", OPTIONS[key], "1"])
-
-
 def address_of(
     config: Path,
     connect: str | None = None,
@@ -140,13 +122,6 @@ def test_the_options_of_a_tool_win_over_the_configuration(places: Places) -> Non
     places.fill()
     assert address_of(places.option, "tcp/10.0.0.1:1", "r8") == ("tcp/10.0.0.1:1", "r8", "")
     assert address_of(places.option, robot_id="r8") == ("tcp/127.0.0.1:7448", "r8", "")
-
-
-def test_a_tool_connects_to_the_router_of_a_daemon_in_client_mode(places: Places) -> None:
-    places.option.write_text(
-        '[bus]\nmode = "client"\nlisten = ["tcp/127.0.0.1:8"]\nconnect = ["tcp/127.0.0.1:7447"]\n'
-    )
-    assert address_of(places.option)[0] == "tcp/127.0.0.1:7447"
 
 
 def test_a_file_with_a_router_whose_mode_is_peer_may_be_of_a_computer_without_a_daemon(
@@ -184,14 +159,6 @@ def test_a_key_that_does_not_exist_is_refused_with_the_near_name() -> None:
         require_readable("odmo", "echo")
 
 
-def test_published_keys_may_be_followed_and_queried() -> None:
-    for key in ("odom", "state", "cmd/app/x/y"):
-        require_readable(key, "echo")
-        require_readable(key, "get")
-    require_readable("cmd/app/anna", "echo")
-    require_readable("config", "get")
-
-
 def test_the_record_directory_is_from_the_option_the_file_or_the_service_in_this_order(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -205,14 +172,6 @@ def test_the_record_directory_is_from_the_option_the_file_or_the_service_in_this
     assert directories == ["/option", "/file", "/service"]
 
 
-def test_a_relative_record_directory_becomes_an_absolute_path(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    named = with_record_directory(parse(b"", {"record": {"directory": "box"}}))
-    assert named.record.directory == str(tmp_path / "box")
-
-
 def test_a_file_that_this_user_may_not_write_is_refused_before_the_work(
     places: Places, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -221,24 +180,6 @@ def test_a_file_that_this_user_may_not_write_is_refused_before_the_work(
     monkeypatch.setattr(os, "access", lambda *_: False)
     with pytest.raises(MendableError, match="was not changed: it is read-only"):
         writable(None)
-
-
-@pytest.mark.parametrize("named", [True, False])
-def test_write_leaves_the_reference_file_of_a_clone_as_git_has_it(
-    places: Places, named: bool, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    clone = places.here.parent
-    places.here.write_text("")
-    (clone / ".git").mkdir()
-    assert writable(None) == Path("acsard.toml")  # a repository of the operator's own
-    (clone / "acsard").mkdir()
-    (clone / "acsard" / "__init__.py").touch()
-    with pytest.raises(
-        MendableError, match=r"cp .*acsard\.toml robot\.toml.* --config robot\.toml"
-    ):
-        writable(str(places.here) if named else None)
-    (clone / "robot.toml").write_text("")
-    assert writable("robot.toml") == Path("robot.toml")
 
 
 def test_a_good_file_is_printed_with_its_place_and_its_warnings(

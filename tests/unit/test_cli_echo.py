@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from types import SimpleNamespace
 from typing import Any
@@ -22,7 +21,6 @@ from acsard.core.messages.schema import (
 )
 from acsard.host.errors import Exit
 from tests.each import each
-from tests.unit.examples import OUTPUTS
 
 BODY = {"linear": {"x": 0.5}, "name": ["ä", "b\n"], "n": -3, "ok": True, "none": None}
 
@@ -33,31 +31,6 @@ def test_a_message_is_its_json_on_one_line(form: Format, named: bool) -> None:
     line = json_line(encoding_name(form, "State") if named else "", encode(BODY, form))
     assert msgspec.json.decode(line) == BODY
     assert "\n" not in line
-
-
-def test_a_whole_message_is_shown_in_full() -> None:
-    line = json_line("", encode(OUTPUTS, "msgpack"))
-    assert msgspec.json.decode(line) == msgspec.json.decode(encode(OUTPUTS, "json"))
-
-
-@pytest.mark.parametrize("encoding", ["", "application/cdr"])
-def test_cdr_without_a_known_type_is_shown_as_its_bytes(encoding: str) -> None:
-    payload = encode(Twist(Vector3(0.5), Vector3(z=0.2)), "cdr")
-    assert msgspec.json.decode(json_line(encoding, payload)) == {"undecodable": repr(payload)}
-
-
-def test_white_space_in_json_is_removed() -> None:
-    assert json_line("", b' {"a" : 1,\n "b": [1, 2]}\n') == '{"a":1,"b":[1,2]}'
-
-
-def test_a_json_payload_may_be_a_list() -> None:
-    assert json_line("application/json", b"[1, 2]") == "[1,2]"
-
-
-def test_a_number_that_is_not_finite_is_null() -> None:
-    assert json_line("", msgspec.msgpack.encode({"a": math.nan, "b": math.inf})) == (
-        '{"a":null,"b":null}'
-    )
 
 
 @each(

@@ -19,9 +19,7 @@ from acsard.client import fleet as fleets
 from acsard.client.connection import Connection
 from acsard.client.fleet import Row
 from acsard.client.follower import (
-    FIRST_STATE_TIMEOUT_S,
     FLEET_QUERY_PERIOD_S,
-    ROBOT_SILENCE_TIMEOUT_S,
 )
 from acsard.core.messages.encodings import DecodeError
 from acsard.core.messages.schema import Info, RobotState, Time
@@ -114,14 +112,6 @@ def test_the_robot_that_is_gone_for_longest_makes_room_for_a_new_one(
     assert fleet.left_out_text == ""
 
 
-def test_a_robot_whose_liveliness_token_is_deleted_is_not_present(session: Session) -> None:
-    fleet = fleet_of(session)
-    session.announce("robot1")
-    session.announce("robot1", zenoh.SampleKind.DELETE)
-    assert [row.here for row in fleet.rows()] == [False]
-    assert fleet.left_out_text == ""
-
-
 def test_a_state_from_before_a_suspend_is_old(
     session: Session, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -186,15 +176,6 @@ def line_after(fleet: Roster, clock: Clock, seconds: float) -> str:
         fleet.rows()
         clock.now += 0.25
     return drawn(table(fleet.rows(), 120), 120).splitlines()[1].rstrip()
-
-
-def test_a_robot_whose_state_only_a_storage_has_is_gone_and_was_never_seen(
-    session: Session, clock: Clock
-) -> None:
-    robot: Any = Remembers(session)
-    line = line_after(Roster(robot, ("robot1",)), clock, 20.0)
-    assert "never" in line
-    assert line.endswith("GONE, was: commanded by app")
 
 
 def test_a_daemon_that_hangs_is_silent_though_a_storage_answers_for_it(
@@ -284,22 +265,6 @@ def at(sec: int, lines: int = 1300) -> RobotState:
     return replace(STATE, stamp=Time(sec), counters=counters)
 
 
-def test_a_query_gets_the_present_state_before_one_is_published(robot: Robot) -> None:
-    feed = feed_of(robot)
-    assert feed.screen_data().state is None
-    feed.query_state()
-    assert feed.screen_data().state == STATE
-
-
-def test_two_queries_give_two_states_to_compute_rates(robot: Robot) -> None:
-    feed = feed_of(robot)
-    robot.state = BEFORE
-    feed.query_state()
-    robot.state = STATE
-    feed.query_state()
-    assert (feed.screen_data().before, feed.screen_data().state) == (BEFORE, STATE)
-
-
 def test_the_time_between_two_states_is_measured_by_the_viewer_s_clock(robot: Robot) -> None:
     feed = feed_of(robot)
     assert feed.screen_data().passed == 0.0
@@ -322,33 +287,12 @@ def test_the_later_of_an_answer_and_a_published_state_is_shown(robot: Robot, sec
     assert state.stamp == Time(max(1000, sec))
 
 
-def test_a_put_on_a_wildcard_is_not_a_state(robot: Robot) -> None:
-    feed = feed_of(robot)
-    robot.tells(STATE, "acsard/**")
-    feed.poll()
-    assert feed.screen_data().state is None
-
-
 def test_a_state_of_another_version_is_reported_as_such(robot: Robot) -> None:
     feed = feed_of(robot)
     robot.state = DecodeError("wrong_shape", "unknown field")
     with pytest.raises(ReplyError, match="a different version"):
         feed.query_state()
     assert feed.screen_data().undecodable == 1
-
-
-def test_a_silence_is_reported_sooner_once_a_state_has_arrived(robot: Robot) -> None:
-    feed = feed_of(robot)
-    robot.now += FIRST_STATE_TIMEOUT_S - 0.01
-    assert not feed.screen_data().silent
-    robot.now += 0.02
-    assert feed.screen_data().silent
-    robot.tells(STATE)
-    feed.poll()
-    robot.now += ROBOT_SILENCE_TIMEOUT_S - 0.01
-    assert not feed.screen_data().silent
-    robot.now += 0.02
-    assert feed.screen_data().silent
 
 
 def test_the_rates_begin_again_when_another_daemon_answers(robot: Robot) -> None:

@@ -18,24 +18,6 @@ COMMAND = "acsard set limits.linear_speed 0.8"
 ROWS = table([("odom", "1", "a long sentence " * 6), ("tf", "100", "short")], ("KEY", "N"), {1})
 
 
-def test_columns_are_aligned_and_no_line_ends_in_spaces() -> None:
-    lines = plain(ROWS).splitlines()
-    assert lines[0] == "KEY     N"
-    assert lines[1] == ("odom    1  " + "a long sentence " * 6).rstrip()
-    assert lines[2] == "tf    100  short"
-
-
-def test_text_is_never_read_as_markup_or_emoji() -> None:
-    text = "[bold]x[/bold] :smile: [odometry]"
-    assert plain(text, table([(text,)])) == f"{text}\n{text}"
-
-
-def test_a_narrow_table_keeps_every_character() -> None:
-    lines = plain(ROWS, width=30).splitlines()
-    assert max(map(len, lines)) <= 30
-    assert sum(line.count("sentence") for line in lines) == 6
-
-
 def test_a_pipe_gets_whole_rows_without_colours(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

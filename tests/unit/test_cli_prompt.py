@@ -5,8 +5,6 @@ from __future__ import annotations
 import os
 import pty
 import re
-import sys
-import termios
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -59,13 +57,6 @@ def test_a_number_is_asked_for_until_it_is_valid_and_within_its_bounds(
     assert capsys.readouterr().err.count("from 0.5 to 3") == 4
 
 
-def test_enter_alone_is_the_default(types: Types) -> None:
-    with single_key_mode():
-        person = TerminalPrompt()
-        types("\n")
-        assert person.number(OPTIONAL) == 0.0
-
-
 @pytest.mark.parametrize("asked", [lambda p: p.number(DISTANCE), lambda p: p.start("Go.")])
 def test_q_quits_at_every_question(types: Types, asked: Callable[[TerminalPrompt], object]) -> None:
     with single_key_mode():
@@ -115,16 +106,6 @@ def test_nothing_but_enter_starts_a_leg(types: Types) -> None:
         types(" ")
         person.start("Go.")
         assert person.keys(5.0) == " "
-
-
-def test_keys_are_read_singly_and_the_terminal_mode_is_restored(types: Types) -> None:
-    before = termios.tcgetattr(sys.stdin)
-    with single_key_mode():
-        person = TerminalPrompt()
-        assert termios.tcgetattr(sys.stdin) != before
-        types(" a")
-        assert person.keys(5.0) == " a"
-    assert termios.tcgetattr(sys.stdin) == before
 
 
 def test_without_a_prompt_an_optional_number_is_0_and_a_required_one_is_an_error() -> None:

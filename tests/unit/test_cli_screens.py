@@ -31,8 +31,8 @@ from acsard.core.motion.modes import Mode
 from acsard.daemon.latencies import NAMES
 from acsard.top import drive_screen, screen
 from acsard.top.drive_screen import Teleop
-from acsard.top.fleet_table import COLUMNS, table
-from acsard.top.screen import MODE_STYLES, ScreenData, clean, count, rate
+from acsard.top.fleet_table import table
+from acsard.top.screen import MODE_STYLES, ScreenData, rate
 from tests.each import each
 from tests.unit.screens import INFO, MEASURED, SEEN, STATE, UNMEASURED, drawn, lines_of, of, painted
 
@@ -178,54 +178,9 @@ def test_the_screen_of_a_drive_does_not_move_while_figures_change() -> None:
     assert lengths[0] == lengths[1]
 
 
-@each("wheels", [[], [1.0], [1.0] * 9, [float("nan")] * 4])
-def test_wheels_that_are_not_four_numbers_are_shown_as_far_as_they_go(wheels: list[float]) -> None:
-    assert len(lines_of(of(wheels=wheels))) == len(lines_of(SEEN))
-
-
-@each("set_by", [3600, -3600, 1, -1])
-@each("width", [80, 60])
-def test_a_robot_s_clock_that_is_set_changes_no_rate(set_by: int, width: int) -> None:
-    stepped = replace(STATE, stamp=Time(1000 + set_by, 0))
-    text = " ".join("\n".join(lines_of(replace(SEEN, state=stepped, passed=1.0), width)).split())
-    assert "100.0/s 1,300" in text
-    assert "20.0/s 220" in text
-
-
 # robots of a fleet
 
 ROW = Row("robot1", True, replace(STATE, reason="commanded by app"), 0.1)
-
-
-def names_in(lines: list[str]) -> list[str]:
-    return [line.split()[0] for line in lines[1:]]
-
-
-@each("width", [40, 60, 80, 100, 120, 200])
-def test_a_narrow_terminal_has_fewer_columns_but_mode_and_reason(width: int) -> None:
-    state = replace(READY, recording_error="the disk is full: nothing is recorded")
-    head, line = drawn(table([replace(ROW, state=state)], width), width).splitlines()
-    assert head.split() == [c for c, least in COLUMNS.items() if width >= least and c != "BATTERY"]
-    assert line.startswith("robot1  ready")
-    assert "WARNING: rec" in line
-
-
-IN_NEED = {
-    "fault": replace(ROW, state=replace(STATE, mode="fault", reason="a wheel is stuck")),
-    "stopped": replace(ROW, state=replace(STATE, mode="stopped", reason="stopped by request")),
-    "gone": replace(ROW, here=False, age=90.0),
-    "silent": replace(ROW, age=7.0, silent=True),
-    "not there": replace(ROW, state=None, here=False),
-}
-
-
-@each("need", IN_NEED)
-def test_a_robot_that_needs_help_is_shown_first_if_the_fleet_exceeds_the_screen(need: str) -> None:
-    rows = [replace(ROW, robot_id=f"robot{n:02d}") for n in range(29)]
-    shown = table([*rows, replace(IN_NEED[need], robot_id="robot99")], 120, 20)
-    *names, last = names_in(drawn(shown, 120).rstrip("\n").splitlines())
-    assert names == ["robot99", *(row.robot_id for row in rows[:19])]
-    assert last == "and"
 
 
 # any message from the bus
@@ -294,29 +249,6 @@ def test_any_state_fits_any_terminal_and_is_printable(
     for verb, what in shown.items():
         assert max(map(cell_len, drawn(what, width).splitlines())) <= width, verb
         assert harmless(drawn(what, width, colour=True)), verb
-
-
-@each(
-    ("text", "expected"),
-    [
-        ("[bold]not markup[/bold] :smile:", "[bold]not markup[/bold] :smile:"),
-        ("\x1b[2Jgone", "�[2Jgone"),
-        ("\x1b]0;title\x07", "�]0;title�"),
-        ("two\nlines\tand\rback", "two lines and back"),
-        ("right \u202eto left", "right �to left"),
-        ("ze\u200bro wi\u0301dth", "ze�ro wi�dth"),
-        ("Größe 大", "Größe 大"),
-        ("x" * 300, "x" * 256),
-    ],
-)
-def test_text_from_the_bus_keeps_only_printable_characters(text: str, expected: str) -> None:
-    assert clean(text) == expected
-
-
-@each(("number", "text"), [(0, "0"), (1234567, "1,234,567"), (10**30, "1.0e+30"), (-5, "-5")])
-def test_a_count_is_readable_however_large(number: int, text: str) -> None:
-    assert count(number) == text
-    assert len(count(number**1000)) < 15
 
 
 @each(

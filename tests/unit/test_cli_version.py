@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import json
 import os
 import pty
@@ -11,7 +10,6 @@ import shlex
 import subprocess
 import sys
 import termios
-import tomllib
 from collections.abc import Iterator
 from importlib import metadata
 from pathlib import Path
@@ -19,16 +17,14 @@ from typing import TextIO, get_args
 
 import pytest
 
-from acsard import __version__
 from acsard.core.config.settings import LogConfig
 from acsard.core.values import Event
 from acsard.host import extras
-from acsard.host.extras import Extra, install, missing
+from acsard.host.extras import Extra, install
 from acsard.host.logs import Log
 from acsard.host.terminal_modes import may_use_color, single_key_mode
-from acsard.host.version import commit_of, full_version, order, source_of, version
+from acsard.host.version import commit_of, full_version, order, source_of
 from tests.each import each
-from tests.pages import ROOT
 
 
 def git(where: Path, *words: str) -> str:
@@ -110,10 +106,6 @@ def test_versions_sort_as_their_numbers_and_the_commits_of_a_number_are_equal() 
     assert {order(text) for text in ("", "?", "0.2", "0.2.0a", "9" * 99 + ".0.0")} == {()}
 
 
-def test_this_program_has_the_version_of_its_clone() -> None:
-    assert version() == full_version(__version__, source_of(ROOT))
-
-
 PIP = [sys.executable, "-m", "pip", "install"]
 WHEEL = "file:///tmp/acsard-0.2.0-py3-none-any.whl"
 
@@ -173,19 +165,6 @@ def test_uv_and_pipx_keep_the_other_extra(
     assert "[foxglove,tools]" in install("foxglove")
 
 
-def test_the_error_names_the_library_and_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(extras, "find_spec", lambda library: None)
-    assert "needs the library segno" in str(missing("segno"))
-    assert "[tools]" in str(missing("segno"))
-
-
-def test_the_tests_install_both_extras_of_users() -> None:
-    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
-    optional = project["optional-dependencies"]
-    assert set(optional) == {*get_args(Extra), "test", "dds"}
-    assert "acsard[foxglove,tools]" in optional["test"]
-
-
 @pytest.fixture(name="terminal")
 def _terminal(monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[int, TextIO]]:
     """Yield both ends of a terminal that supports colours."""
@@ -197,24 +176,12 @@ def _terminal(monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[int, TextIO]]:
     os.close(ours)
 
 
-def test_a_terminal_has_colours_and_a_file_has_none(terminal: tuple[int, TextIO]) -> None:
-    assert may_use_color(terminal[1])
-    assert not may_use_color(io.StringIO())
-
-
 @pytest.mark.parametrize(("name", "value"), [("NO_COLOR", "1"), ("TERM", "dumb")])
 def test_the_environment_can_disable_colours(
     terminal: tuple[int, TextIO], monkeypatch: pytest.MonkeyPatch, name: str, value: str
 ) -> None:
     monkeypatch.setenv(name, value)
     assert not may_use_color(terminal[1])
-
-
-def test_an_empty_no_color_variable_does_not_disable_colours(
-    terminal: tuple[int, TextIO], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("NO_COLOR", "")
-    assert may_use_color(terminal[1])
 
 
 @pytest.mark.parametrize("wanted", [True, False])
@@ -228,16 +195,6 @@ def test_the_log_of_a_terminal_is_coloured_unless_no_color_is_set(
     logs.event(Event("stop", "stopped"))
     logs.close()
     assert (b"\x1b[" in os.read(ours, 4096)) is wanted
-
-
-def test_the_console_s_log_in_a_file_has_no_colours(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("acsard.host.logs._fitting", lambda stream: "console")
-    stream = io.StringIO()
-    logs = Log(LogConfig(), stream)
-    logs.event(Event("stop", "stopped"))
-    logs.close()
-    assert "stopped" in stream.getvalue()
-    assert "\x1b" not in stream.getvalue()
 
 
 CTRL_S = b"\x13"

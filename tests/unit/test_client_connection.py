@@ -23,10 +23,9 @@ from acsard.client.reads import decoder
 from acsard.client.ride import MAX_SOURCE_TIMEOUT_S
 from acsard.core.config.settings import Config, DriveConfig, JointsConfig
 from acsard.core.incoming.commands import Arrival, Receiver
-from acsard.core.incoming.imu import reading
 from acsard.core.incoming.queries import Queries, Query
 from acsard.core.messages import schema
-from acsard.core.messages.encodings import FORMATS, DecodeError, Decoder, Format, encode
+from acsard.core.messages.encodings import FORMATS, Decoder, Format, encode
 from acsard.core.messages.refusals import MAX_COMMAND_BYTES
 from acsard.core.messages.schema import (
     Beat,
@@ -99,15 +98,6 @@ def session() -> Session:
 def client_of(session: Session) -> Connection:
     fake: Any = session
     return Connection(fake, "acsar", "app")
-
-
-def test_each_command_has_its_sender_and_its_sequence_number(session: Session) -> None:
-    client = client_of(session)
-    for _ in range(3):
-        client.send(0.5)
-    assert [command.sequence for command in session.heard] == [1, 2, 3]
-    (sender,) = {command.sender for command in session.heard}
-    assert sender == client.sender
 
 
 def test_each_command_echoes_the_newest_beat_and_none_is_sent_before_the_first(
@@ -280,19 +270,6 @@ def test_ctrl_c_ends_a_drive_whose_connection_is_closed_with_a_keyboard_interrup
         Client(robot).drive(0.1, seconds=1.0)
 
 
-async def test_a_cancelled_async_drive_whose_connection_is_closed_is_cancelled(
-    session: Session, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    robot = client_of(session)
-    without_states(robot, monkeypatch)
-    driving = asyncio.create_task(AsyncClient(robot).drive(0.1, seconds=1.0))
-    await asyncio.sleep(0)
-    session.close()
-    driving.cancel()
-    with pytest.raises(asyncio.CancelledError):
-        await driving
-
-
 @pytest.mark.parametrize("method", ["pose", "whoami", "call", "get", "set"])
 async def test_an_async_call_that_takes_too_long_raises_a_documented_error(
     session: Session, monkeypatch: pytest.MonkeyPatch, method: str
@@ -318,13 +295,6 @@ async def test_an_async_call_without_a_new_thread_raises_a_documented_error(
             await AsyncClient(client_of(session)).pose()
     finally:
         threading.stack_size(usual)
-
-
-def test_two_sessions_of_one_process_are_two_senders(session: Session) -> None:
-    other = Session("fedcba9876543210")
-    for peer in (session, other):
-        client_of(peer).send(0.5)
-    assert session.heard[0].sender != other.heard[0].sender
 
 
 @pytest.mark.parametrize("name", ["odm", "statte"])
@@ -447,22 +417,6 @@ WHOLE = Imu(
 @each("form", FORMATS)
 def test_an_imu_message_is_decoded_from_every_form(form: Format) -> None:
     assert encode(decoder("imu").decode("", encode(WHOLE, form)), "json") == encode(WHOLE, "json")
-
-
-@each("payload", [TURN, b"\x81\xb0angular_velocity\x81\xa1z\xcb?\xe0\x00\x00\x00\x00\x00\x00"])
-def test_an_imu_message_needs_only_the_angular_velocity_as_for_the_daemon(payload: bytes) -> None:
-    arrival = Arrival("imu", True, payload, "", 0, None, "")
-    message = decoder("imu").decode("", payload)
-    assert message.angular_velocity.z == reading(arrival)[0].rate == 0.5
-    assert message.angular_velocity_covariance == UNKNOWN
-
-
-@each("payload", [b"{}", b'{"angular_velocity":{"z":"0.5"}}'])
-def test_an_imu_message_that_the_daemon_refuses_is_not_decoded(payload: bytes) -> None:
-    with pytest.raises(DecodeError):
-        reading(Arrival("imu", True, payload, "", 0, None, ""))
-    with pytest.raises(DecodeError):
-        decoder("imu").decode("", payload)
 
 
 def test_a_wrong_argument_of_drive_sends_nothing(session: Session) -> None:

@@ -80,10 +80,3 @@ def test_a_robot_that_is_pushed_aside_on_a_straight_course_turns_back() -> None:
     robot.yaw = 0.3
     robot.follow(course)
     assert robot.yaw == pytest.approx(0.0, abs=0.02)
-
-
-@each("yaw", [0.0, 1.0, -3.1, 3.1])
-def test_odometry_has_its_heading_and_its_time_as_numbers(yaw: float) -> None:
-    odom = Robot(0.0, yaw).odom()
-    assert odom.yaw == pytest.approx(yaw)
-    assert odom.time == 12.25

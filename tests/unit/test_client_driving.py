@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator
-from threading import Thread, get_ident
 from types import SimpleNamespace
 from typing import Any
 
@@ -13,7 +12,6 @@ import zenoh
 from msgspec.structs import replace
 
 from acsard.client.driving import (
-    MAX_END_S,
     Driver,
     Steps,
     UnheardError,
@@ -23,7 +21,7 @@ from acsard.client.driving import (
     turn,
 )
 from acsard.client.follower import FIRST_STATE_TIMEOUT_S, ROBOT_SILENCE_TIMEOUT_S, SETTLED_S
-from acsard.client.ride import GRACE_S, OPEN_TIMEOUT_S, objection
+from acsard.client.ride import GRACE_S, OPEN_TIMEOUT_S
 from acsard.core.messages.schema import RobotState, SourceState, Time
 from acsard.core.values import NS_PER_S
 from acsard.host import clock
@@ -180,43 +178,6 @@ def test_a_drive_starts_with_zeros_and_returns_when_the_robot_is_at_rest() -> No
     assert (world.subscribed, world.asked) == (False, 0)
 
 
-def test_a_state_that_is_rarely_published_is_queried() -> None:
-    world = World(followed)
-    world.published = False
-    assert world.drive() < 2.4
-    assert world.sent.count(0.5) in (20, 21)
-    assert world.asked < 12
-
-
-def test_an_answer_of_another_thread_is_processed_on_the_driving_thread(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    # With two threads the drive could combine the time of one state with the refusal in another.
-    world, readers = World(followed), set()
-    world.published = False
-    made = world._sample
-
-    def sample() -> Any:
-        message = made()
-        payload: bytes = message.payload.to_bytes()
-
-        def read() -> bytes:
-            readers.add(get_ident())
-            return payload
-
-        message.payload = SimpleNamespace(to_bytes=read)
-        return message
-
-    def ask(name: str, take: Any) -> None:
-        thread = Thread(target=take, args=(sample(),))
-        thread.start()
-        thread.join()
-
-    monkeypatch.setattr(world, "start_query", ask)
-    world.drive()
-    assert readers == {get_ident()}
-
-
 def without_speed(t: float, last: float, sent: list[float]) -> RobotState:
     state = followed(t, last, sent)
     return state if t < 1.3 else replace(state, linear=None, angular=None)
@@ -279,18 +240,6 @@ def test_a_drive_that_is_not_followed_ends_with_the_reason_and_a_zero(
     assert (world.sent[-1], world.subscribed) == (0.0, False)
 
 
-def test_a_short_drive_that_was_hardly_followed_does_not_return_as_a_success() -> None:
-    with pytest.raises(NotDrivenError, match="has priority"):
-        World(after(0.45, HIGHER)).drive(0.8 * GRACE_S)
-
-
-def test_a_short_time_in_which_the_robot_follows_no_source_does_not_end_a_drive() -> None:
-    held_up = replace(FOLLOWED, mode="ready", reason="waiting for a command", source="")
-    world = World(lambda *of: held_up if 0.9 < of[0] < 1.2 else followed(*of))
-    world.drive()
-    assert world.sent.count(0.5) in (20, 21)
-
-
 @each(
     ("trouble", "begins", "lasts", "seconds"),
     [
@@ -347,15 +296,6 @@ def test_a_stored_state_of_a_dead_robot_does_not_keep_a_drive_running(
     assert world.sent[-1] == 0.0
 
 
-@each("last", [FOLLOWED, STOPPED, replace(FOLLOWED, sender="")])
-def test_a_stored_state_of_a_robot_that_died_long_ago_starts_no_drive(last: RobotState) -> None:
-    world = World(followed)
-    world.dies, world.stored = 0.0, sample_of(last)
-    with pytest.raises(NoAnswerError, match="nothing received"):
-        world.drive(0.4)
-    assert set(world.sent) == {0.0}
-
-
 def test_a_daemon_of_another_version_is_distinguished_from_a_dead_one() -> None:
     world: Any = World(followed)
     world._sample = lambda: raw_sample(b"{}")
@@ -390,40 +330,6 @@ def test_a_value_that_is_not_a_number_is_refused_before_a_command_is_sent() -> N
         drive(10**400, 0.0, 1.0)
 
 
-@each("seconds", [0, -1, -0.5])
-def test_a_drive_without_a_positive_duration_is_refused_before_a_command_is_sent(
-    seconds: float,
-) -> None:
-    with pytest.raises(UsageError, match=f"seconds = {seconds:g}: a drive needs a time above 0"):
-        drive(5.0, 0.0, seconds)
-
-
-@each(
-    ("state", "words"),
-    [
-        (FOLLOWED, ""),
-        (replace(FOLLOWED, sender=""), ""),  # an older daemon does not name the sender
-        (replace(FOLLOWED, sources=[source("1 other sender of this source must wait")]), ""),
-        (
-            replace(FOLLOWED, sender=OTHER),
-            f"another program, {OTHER}, drives the robot as source app",
-        ),
-        (OPENING, NEUTRAL),
-        (HIGHER, "teleop has priority"),
-        (replace(STOPPED, mode="ready", sources=[source("a command", 7.0)]), "receives no command"),
-        (replace(STOPPED, mode="ready", sources=[source("app may be late")]), "may be late"),
-    ],
-)
-def test_the_error_has_the_reason_that_the_daemon_reports(state: RobotState, words: str) -> None:
-    text = objection(state, "app", US)
-    assert (
-        text.startswith(words)
-        if words != "may be late" and words != "receives no command"
-        else (words in text)
-    )
-    assert bool(text) == bool(words)
-
-
 # the zeros at the end of a drive that was interrupted
 
 
@@ -441,16 +347,6 @@ def test_zeros_are_repeated_until_the_state_shows_rest() -> None:
     assert set(world.sent) == {0.0}
     assert len(world.sent) > 20
     assert not world.subscribed
-
-
-def test_zeros_end_early_for_a_robot_that_cannot_drive_or_that_is_gone() -> None:
-    world = World(lambda t, last, sent: replace(STOPPED, linear=0.3))
-    assert zeros_of(world) < 0.5
-    world = World(lambda t, last, sent: None)
-    assert zeros_of(world) == pytest.approx(MAX_END_S, abs=0.06)
-    dead: Any = World(followed)
-    dead.send = closed
-    assert zeros_of(dead) == 0.0
 
 
 @each(

@@ -17,10 +17,9 @@ from acsard.client.follower import (
     ROBOT_SILENCE_TIMEOUT_S,
     Follower,
     Watch,
-    restarted,
 )
 from acsard.core.messages.schema import RobotState, Time
-from tests.unit.screens import BEFORE, STATE, raw_sample, sample_of
+from tests.unit.screens import STATE, raw_sample, sample_of
 
 TICK = 0.01
 
@@ -33,21 +32,6 @@ def query_times(follower: Follower, since: float, until: float) -> list[float]:
     """Return the times at which the follower queries the state."""
     times = [since + n * TICK for n in range(round((until - since) / TICK))]
     return [now for now in times if follower.query_is_due(now)]
-
-
-def test_the_age_of_a_state_is_the_time_since_its_arrival() -> None:
-    follower = Follower(100.0)
-    assert follower.age(101.0) == 1.0
-    follower.published(STATE, 101.5)
-    assert follower.state == STATE
-    assert follower.age(102.0) == 0.5
-
-
-def test_a_robot_that_publishes_often_is_never_queried() -> None:
-    follower = Follower(0.0)
-    for n in range(100):
-        assert not query_times(follower, n / 10, (n + 1) / 10)
-        follower.published(at(n), (n + 1) / 10)
 
 
 def test_a_robot_that_rarely_publishes_is_queried_at_even_intervals() -> None:
@@ -77,18 +61,6 @@ def test_a_robot_that_is_rarely_queried_is_not_silent_between_its_answers() -> N
         assert follower.answered(at(sec), now)
 
 
-def test_the_first_answer_is_no_sign_of_life_and_a_second_query_follows_immediately() -> None:
-    follower = Follower(0.0)
-    assert follower.query_is_due(1.0)
-    assert not follower.answered(at(5), 1.1)
-    assert follower.state == at(5)
-    assert not follower.is_confirmed
-    assert follower.query_is_due(1.1)
-    assert follower.answered(at(6), 1.2)
-    assert follower.is_confirmed
-    assert follower.age(1.2) == 0.0
-
-
 def test_the_state_that_a_storage_repeats_is_no_sign_of_life() -> None:
     follower = Follower(0.0)
     follower.published(at(5), 1.0)
@@ -105,20 +77,6 @@ def test_the_second_answer_of_a_robot_with_a_set_back_clock_is_a_sign_of_life() 
     assert not follower.answered(at(3), 2.0)
     assert follower.answered(at(4), 3.0)
     assert follower.state == at(4)
-
-
-def test_a_published_state_counts_whatever_its_stamp_is() -> None:
-    follower = Follower(0.0)
-    follower.published(at(10**6), 1.0)
-    follower.published(at(1), 2.0)
-    assert (follower.state, follower.age(2.0)) == (at(1), 0.0)
-
-
-def test_decreasing_counters_show_a_restarted_daemon() -> None:
-    assert not restarted(None, STATE)
-    assert not restarted(BEFORE, STATE)
-    assert restarted(STATE, BEFORE)
-    assert restarted(STATE, replace(STATE, counters={}))
 
 
 class Robot:
@@ -148,15 +106,6 @@ class Robot:
 UNREADABLE = raw_sample(b"{}")
 
 
-def test_the_states_that_arrived_are_returned_in_order() -> None:
-    robot = Robot()
-    watch = Watch(robot, 0.0)
-    robot.queue.extend(map(sample_of, (at(1), at(2))))
-    assert watch.poll(0.1) == [at(1), at(2)]
-    assert watch.poll(0.2) == []
-    assert watch.age(0.2) == 0.1
-
-
 def test_a_state_published_after_the_answer_replaces_the_answer() -> None:
     robot = Robot()
     watch = Watch(robot, 0.0)
@@ -167,17 +116,6 @@ def test_a_state_published_after_the_answer_replaces_the_answer() -> None:
     robot.queue.append(sample_of(at(3)))
     assert watch.poll(QUERY_PERIOD_S + 0.2) == [at(3)]
     assert watch.state == at(3)
-
-
-def test_a_state_that_was_published_before_the_answer_comes_first() -> None:
-    robot = Robot()
-    watch = Watch(robot, 0.0)
-    robot.queue.append(sample_of(at(1)))
-    watch.poll(0.0)
-    robot.answer = sample_of(at(3))
-    watch.poll(QUERY_PERIOD_S + 0.1)
-    robot.queue.append(sample_of(at(2)))
-    assert watch.poll(QUERY_PERIOD_S + 0.2) == [at(2), at(3)]
 
 
 def test_unreadable_messages_are_counted_until_a_readable_one_arrives() -> None:
@@ -197,9 +135,3 @@ def test_a_flood_of_messages_does_not_block_the_caller() -> None:
     robot.queue.extend([UNREADABLE] * (MAX_QUEUED_SAMPLES + 7))
     watch.poll(0.0)
     assert len(robot.queue) == 7
-
-
-def test_the_subscription_ends_with_the_watch() -> None:
-    robot = Robot()
-    Watch(robot, 0.0).end()
-    assert not robot.followed

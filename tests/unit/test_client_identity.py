@@ -74,14 +74,6 @@ def test_a_silent_robot_leads_to_questions_first_about_the_id_and_to_no_claim() 
     assert ClientIdentity("viewer", "anna", "x").silence == stranger.silence == ""
 
 
-def test_the_message_names_the_robot_and_the_endpoint_that_were_queried() -> None:
-    def nobody(name: str, take: Any) -> None:
-        pass
-
-    result = identity(nobody, "", "joe/1/aa", "robot1", "tcp/127.0.0.1:7448")
-    assert (result.robot, result.endpoint) == ("robot1", "tcp/127.0.0.1:7448")
-
-
 NOBODY_LISTENS = "tls/127.0.0.1:1"
 
 
@@ -126,14 +118,6 @@ def test_a_directory_without_certificates_is_reported_and_not_taken_for_a_missin
     ):
         pass
     assert isinstance(error.value, ValueError)
-
-
-def test_every_documented_error_is_exported_by_the_client() -> None:
-    assert client.__doc__ is not None
-    names = {line.split()[0] for line in client.__doc__.splitlines() if line.startswith("    ")}
-    errors = {name for name in names if name.endswith("Error")}
-    assert errors == {n for n in client.__all__ if n.endswith("Error")} - {"AcsardError"}
-    assert all(issubclass(getattr(client, name), client.AcsardError) for name in errors)
 
 
 def test_a_missing_daemon_is_reported_without_the_errors_of_zenoh() -> None:

@@ -44,15 +44,6 @@ def row(name: str, level: int, message: str, advice: str = "", code: str = "") -
     return DiagnosticStatus(level, f"acsard: {name}", message, "acsar", values)
 
 
-def test_each_report_of_the_daemon_is_a_finding_with_its_advice() -> None:
-    rows = (row("mode", 0, "ready"), row("wheels", 1, "blocked", "look"), row("gyro", 3, "old"))
-    assert list(reported(rows)) == [
-        Finding("mode", "ok", "ready"),
-        Finding("wheels", "warning", "blocked", "look"),
-        Finding("gyro", "failure", "old"),
-    ]
-
-
 def test_a_reason_of_two_reports_is_printed_once_where_it_is_not_ok() -> None:
     waits = row("mode", 0, "nothing came", code="silent")
     link = row("serial link", 2, "down: nothing came", "check", code="silent")
@@ -169,25 +160,6 @@ def test_the_scheduling_policy_of_a_running_daemon_is_reported(
 
 
 # A person's own simulator of their board often keeps both ends of its pty open.
-OWN_BOARD = """
-import os, pty, sys
-board, port = pty.openpty()
-print(os.ttyname(port), flush=True)
-sys.stdin.read()
-"""
-
-
-def test_the_simulator_of_a_person_s_own_board_is_not_to_be_killed() -> None:
-    with subprocess.Popen(
-        [sys.executable, "-c", OWN_BOARD], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
-    ) as board:
-        assert board.stdout is not None
-        findings = list(serial_port(board.stdout.readline().strip(), simulated=False))
-        assert board.stdin is not None
-        board.stdin.close()
-    (used,) = [finding for finding in findings if f"(pid {board.pid})" in finding.text]
-    assert (used.level, used.mend) == ("ok", "")
-    assert "simulates the board" in used.text
 
 
 def test_a_program_that_uses_the_port_in_place_of_the_daemon_is_a_failure() -> None:
@@ -248,8 +220,3 @@ def test_the_udev_rules_name_exactly_the_usual_boards() -> None:
     lines = re.findall(re.escape(LINE).replace("%s", r"([\w|]+)"), RULES.read_text())
     named = [f"{vendor}:{model}" for vendor, models in lines for model in models.split("|")]
     assert sorted(named) == sorted(BOARDS)
-
-
-def test_no_other_line_of_the_rules_chooses_a_board() -> None:
-    chosen = [row for row in RULES.read_text().splitlines() if 'ENV{ACSAR_MCU}="1"' in row]
-    assert all(re.fullmatch(re.escape(LINE).replace("%s", r"[\w|]+"), row) for row in chosen)

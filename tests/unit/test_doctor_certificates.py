@@ -56,16 +56,6 @@ def typed(mend: str, where: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert main(shlex.split(command)) == 0
 
 
-def test_the_advised_command_renews_the_robots_own_certificate(
-    fleet: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    Authority.load(fleet, str).issue(fleet, "robot", ["localhost"], 9.9)
-    result = finding(fleet)
-    assert (result.level, result.text) == ("warning", f"{fleet}: expires in 10 days")
-    typed(result.mend, fleet, monkeypatch)
-    assert finding(fleet).level == "ok"
-
-
 def test_the_advised_command_replaces_a_key_that_only_zenoh_refuses(
     fleet: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

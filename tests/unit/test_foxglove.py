@@ -133,29 +133,6 @@ def test_a_daemon_whose_reply_cannot_be_read_is_queried_once_a_second_and_report
     assert world.server.shown[2:] == ["without daemon"]
 
 
-def test_a_daemon_that_ends_after_an_unreadable_reply_is_reported_as_gone(world: World) -> None:
-    world.during_query = fail
-    world.restart()
-    world.passes(1.0)
-    world.daemon(zenoh.SampleKind.DELETE)
-    world.passes(1.0)
-    assert world.server.shown == [str(UNREADABLE), GONE]
-
-
-def test_the_configuration_is_read_after_a_restart_that_falls_into_one_round(
-    world: World, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def forward() -> None:
-        monkeypatch.setattr(world.bridge._relay, "forward", usual)
-        world.restart()
-
-    usual = world.bridge._relay.forward
-    monkeypatch.setattr(world.bridge._relay, "forward", forward)
-    world.passes(1.0)
-    assert world.offers("x")
-    assert world.printed == [BACK]
-
-
 def test_the_configuration_is_read_again_if_the_daemon_restarts_while_it_is_queried(
     world: World,
 ) -> None:
@@ -234,28 +211,12 @@ def names(deduplicator: EventDeduplicator, report: Events) -> list[str]:
     return [line.name for line in deduplicator.of(report)]
 
 
-def test_the_first_answer_gives_all_stored_events() -> None:
-    lines = EventDeduplicator().of(events(3))
-    assert [(line.stamp.sec, line.level, line.name) for line in lines] == [
-        (0, 30, "mode0"),
-        (1, 30, "mode1"),
-        (2, 30, "mode2"),
-    ]
-    assert lines[0].msg == "first 0 (by ann)"
-    assert len(EventDeduplicator().of(events(1000))) == 20
-
-
-@each(("before", "now"), [(3, 4), (3, 3), (0, 5), (19, 23), (40, 60), (40, 55)])
+@each(("before", "now"), [(3, 4), (3, 3), (0, 5), (19, 23), (40, 60), (40, 55), (10, 100)])
 def test_each_event_is_reported_once(before: int, now: int) -> None:
     deduplicator = EventDeduplicator()
     deduplicator.of(events(before))
-    assert names(deduplicator, events(now)) == [f"mode{n}" for n in range(before, now)]
-
-
-def test_events_that_the_daemon_no_longer_stores_are_skipped() -> None:
-    deduplicator = EventDeduplicator()
-    deduplicator.of(events(10))
-    assert names(deduplicator, events(100)) == [f"mode{n}" for n in range(80, 100)]
+    stored = range(max(before, now - 20), now)
+    assert names(deduplicator, events(now)) == [f"mode{n}" for n in stored]
 
 
 def test_an_answer_older_than_the_last_message_reports_no_event() -> None:
@@ -265,25 +226,8 @@ def test_an_answer_older_than_the_last_message_reports_no_event() -> None:
     assert names(deduplicator, events(11)) == ["mode10"]
 
 
-def test_an_event_that_is_updated_does_not_report_older_events_again() -> None:
-    deduplicator, fault = EventDeduplicator(), events(1).events[0]
-    missed = LogEvent(Time(5), "periods_missed", "warning", "3 more periods", "", 1)
-    deduplicator.of(Events(Time(5), 2, [fault, missed]))
-    later = replace(missed, stamp=Time(8), text="9 more periods")
-    assert names(deduplicator, Events(Time(8), 4, [fault, later])) == ["periods_missed"]
-
-
 def test_a_restarted_daemon_s_events_are_reported_from_the_first() -> None:
     deduplicator = EventDeduplicator()
     deduplicator.of(events(10))
     later = replace(events(2, "second"), stamp=Time(11))
     assert names(deduplicator, later) == ["mode0", "mode1"]
-
-
-@each("total", [3, 4])
-def test_a_restarted_daemon_that_has_logged_as_many_events_reports_all_of_them(total: int) -> None:
-    deduplicator = EventDeduplicator()
-    deduplicator.of(events(3))
-    restarted = [replace(event, stamp=Time(10)) for event in events(total, "second").events]
-    event_names = names(deduplicator, Events(Time(11), total, restarted))
-    assert event_names == [f"mode{n}" for n in range(total)]

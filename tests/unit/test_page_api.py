@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import re
-from collections import Counter
 from collections.abc import Hashable
 from pathlib import Path
 from typing import Any
@@ -14,10 +13,10 @@ from jsonschema import Draft202012Validator
 from openapi_spec_validator import OpenAPIV31SpecValidator
 
 from acsard.core.messages.keys_and_roles import SERVICES, TOPICS, row_of
-from acsard.core.messages.permissions import SERVICE_ROLES, least_role
+from acsard.core.messages.permissions import SERVICE_ROLES
 from acsard.web.app import ROUTES
-from acsard.web.openapi import FROM_ROBOT, TO_ROBOT, document
-from acsard.web.routes import PARAMETERS, is_queryable
+from acsard.web.openapi import TO_ROBOT, document
+from acsard.web.routes import is_queryable
 from acsard.web.socket_messages import MESSAGE_TYPES, FrameError, decode
 from tests.each import each
 
@@ -57,12 +56,6 @@ def test_the_description_is_valid_openapi() -> None:
     assert [error.message for error in OpenAPIV31SpecValidator(whole).iter_errors()] == []
 
 
-@pytest.mark.slow
-def test_every_schema_is_valid_json_schema() -> None:
-    for schema in WHOLE["components"]["schemas"].values():
-        Draft202012Validator.check_schema(schema)
-
-
 MANUAL = Path(__file__).parents[2] / "deploy/manual/pages"
 
 SOCKET = (MANUAL / "reference/websocket.md").read_text()
@@ -87,52 +80,6 @@ def test_the_socket_accepts_exactly_the_messages_that_its_schema_allows(message:
     assert Draft202012Validator(schema).is_valid(json.loads(message)) == valid
 
 
-def test_the_socket_and_the_token_are_described() -> None:
-    messages = WHOLE["paths"]["/ws"]["get"]["x-messages"]
-    assert messages["to"]["$ref"].endswith(f"/{TO_ROBOT}")
-    assert messages["from"]["$ref"].endswith(f"/{FROM_ROBOT}")
-    assert set(WHOLE["paths"]["/token"]["post"]["responses"]) >= {"303", "401", "429"}
-
-
-def test_parameters_in_a_path_are_declared() -> None:
-    for path, item in WHOLE["paths"].items():
-        for action in item.values():
-            names = {parameter["name"] for parameter in action.get("parameters", ())}
-            assert names == {part[1:-1] for part in path.split("/") if part.startswith("{")}
-
-
-def test_a_wildcard_is_not_a_valid_type_name() -> None:
-    name = re.compile(PARAMETERS["type"])
-    assert name.fullmatch("Twist")
-    assert not any(map(name.fullmatch, ("*", "**", "a$*", "x?fmt=cdr", "a/b", "", "a" * 99)))
-
-
-def test_each_path_names_the_least_role_that_may_use_it() -> None:
-    def role(path: str, method: str) -> str:
-        here, away = WHOLE["paths"][path][method]["security"]
-        assert here == {}
-        ((least,),) = away.values()
-        return str(least)
-
-    for verb in SERVICES:
-        assert role(f"/api/srv/{verb}", "post") == SERVICE_ROLES[verb]
-    for key in ("state", "config", "info"):
-        assert role(f"/api/{key}", "get") == least_role(key)
-    assert role("/api/recordings/{name}", "get") == "operator"
-    assert WHOLE["paths"]["/token"]["post"]["security"] == [{}]
-
-
-def test_each_message_to_the_robot_names_the_least_role_that_may_send_it() -> None:
-    schemas = WHOLE["components"]["schemas"]
-    least = {kind: schemas[kind.__name__]["x-least-role"] for kind in MESSAGE_TYPES.values()}
-    assert least == {kind: kind.least for kind in MESSAGE_TYPES.values()}
-    assert set(least.values()) == {"viewer", "operator"}
-
-
-def test_each_method_of_a_path_has_one_row() -> None:
-    assert max(Counter((row.method, row.path) for row in ROUTES).values()) == 1
-
-
 def test_only_the_page_s_own_files_and_the_token_are_open_to_strangers() -> None:
     is_open = {row.path for row in ROUTES if row.least is None}
     assert is_open == {"/", "/favicon.ico", "/page/{name}", "/token"}
@@ -145,12 +92,6 @@ def test_only_a_stop_is_served_beyond_the_limits_of_a_token() -> None:
 def test_each_service_has_the_role_that_the_bus_asks_for() -> None:
     roles = {row.path: row.least for row in ROUTES if row.method == "POST"}
     assert {verb: roles[f"/api/srv/{verb}"] for verb in SERVICES} == SERVICE_ROLES
-
-
-def test_a_parameter_is_one_part_of_a_path() -> None:
-    for row in ROUTES:
-        parts = [part for part in row.path.split("/") if "{" in part]
-        assert parts == [f"{{{name}}}" for name in row.parameters], row.path
 
 
 def named(cell: str) -> set[tuple[str, str]]:

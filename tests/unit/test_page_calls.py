@@ -266,10 +266,3 @@ def test_a_row_has_its_value_its_unit_its_range_and_when_it_may_change() -> None
     assert "stands" in ROWS["limits.wheel_speed"].when
     assert row.keep
     assert not ROWS["commands.sources.app.timeout"].keep
-
-
-def test_a_setting_with_fixed_choices_lists_them() -> None:
-    row = ROWS["log.level"]
-    assert isinstance(row.choices, list)
-    assert row.value in row.choices
-    assert len(row.choices) > 2

@@ -50,12 +50,6 @@ def test_a_file_is_sent_compressed_and_with_its_type(page: Path) -> None:
     assert len(file.packed) < len(file.body)
 
 
-def test_a_small_file_is_not_compressed(page: Path) -> None:
-    file = page_files(page).get("small.js")
-    assert file is not None
-    assert file.packed is None
-
-
 @pytest.mark.parametrize(
     "name",
     [
@@ -97,14 +91,6 @@ def test_a_page_that_the_browser_has_already_keeps_its_policy() -> None:
     policies = [response.headers["Content-Security-Policy"] for response in (first, again)]
     assert policies[0] == policies[1]
     assert policies[0].endswith(page.policy)
-
-
-def test_any_other_file_allows_no_inline_script() -> None:
-    file = page_files().get("main.js")
-    assert file is not None
-    answer = file_answer(make_mocked_request("GET", "/page/main.js"), file)
-    assert "script-src" not in answer.headers["Content-Security-Policy"]
-    assert "default-src 'self'" in answer.headers["Content-Security-Policy"]
 
 
 @pytest.mark.parametrize("secure", [True, False])

@@ -15,11 +15,6 @@ from acsard.web.callers import RequestRefusedError
 from acsard.web.recordings import BlackBox, Recording, files, rows
 
 
-def test_a_robot_that_has_just_started_has_no_recordings(tmp_path: Path) -> None:
-    """The recorder makes its directory about a second after the daemon's start."""
-    assert files(tmp_path / "record", "acsar") == []
-
-
 def test_a_file_that_the_daemon_deletes_meanwhile_does_not_hide_the_others(
     tmp_path: Path,
 ) -> None:

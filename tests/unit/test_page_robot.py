@@ -7,7 +7,6 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from typing import Any, cast
-from unittest.mock import Mock
 
 import msgspec
 import pytest
@@ -127,12 +126,6 @@ def test_a_daemon_of_another_version_is_reported_as_such(world: World) -> None:
     assert at <= FIRST_STATE_TIMEOUT_S + 2 * PROCESS_PERIOD_S
 
 
-def test_a_robot_that_returns_is_present_without_delay(world: World) -> None:
-    changes = world.reachability_changes(10.0, lambda t: None if 2.0 < t < 6.0 else world.state())
-    assert [bool(reason) for _, reason in changes] == [False, True, False]
-    assert changes[-1][0] <= 6.0 + 2 * PROCESS_PERIOD_S
-
-
 class AnsweringRobot(Robot):
     """A client whose robot also answers with its version and its configuration."""
 
@@ -168,30 +161,6 @@ async def test_the_page_learns_about_its_robot_although_it_was_not_there_at_firs
     assert not running.done()
     assert page.gone == ""
     running.cancel()
-
-
-async def test_a_query_that_hangs_does_not_hide_the_silence_of_its_robot(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    client, answers = AnsweringRobot(failures=0), threading.Event()
-
-    def get(name: str) -> Any:
-        answers.wait(20.0)
-        raise NoAnswerError("no answer")
-
-    monkeypatch.setattr(client, "get", get)
-    client.queue.append(sample_of(STATE))
-    page = FollowedRobot(
-        Address("tcp/x:1", "acsar", ""), lambda: cast(Any, client), ABOUT, Counts()
-    )
-    running = asyncio.create_task(page.run())
-    async with asyncio.timeout(10.0):
-        while page.gone:
-            await asyncio.sleep(0.01)
-        while not page.gone:
-            await asyncio.sleep(0.01)
-    running.cancel()
-    answers.set()
 
 
 @pytest.mark.parametrize("method", ["update", "poll"])
@@ -297,21 +266,6 @@ def test_the_age_of_a_message_counts_a_suspend(
     assert stream.value()[2] >= 3_600_000.0
 
 
-def test_an_age_is_never_negative(
-    samples: list[zenoh.Sample], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """The age comes from several clocks that are read one after the other.
-
-    If the thread waits for a core between two readings, the difference may be negative.
-    """
-    stream = Stream()
-    with monkeypatch.context() as patched:
-        slept_ns = clock.asleep_ns() + NS_PER_S
-        patched.setattr(clock, "asleep_ns", lambda: slept_ns)
-        stream.take(samples[0])
-    assert stream.value()[2] == 0.0
-
-
 def test_a_put_on_a_wildcard_is_not_a_message_of_the_key(session: zenoh.Session) -> None:
     streams, client = Streams(), Connection(session, "acsar", "app")
     stream = streams.follow("events")
@@ -325,14 +279,3 @@ def test_a_put_on_a_wildcard_is_not_a_message_of_the_key(session: zenoh.Session)
     session.put(KEY, b"3", encoding="application/json")
     time.sleep(0.1)
     assert stream.value()[:2] == (2, b"2")
-
-
-def test_a_key_that_is_left_and_followed_again_keeps_its_subscription() -> None:
-    streams, client = Streams(), Mock()
-    first = streams.follow("odom")
-    streams.update(client)
-    streams.leave("odom")
-    assert streams.follow("odom") is first
-    streams.update(client)
-    assert client.listen.call_count == 1
-    assert not first.subscription.undeclare.called

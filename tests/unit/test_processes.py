@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import fcntl
 import os
 import pty
 import subprocess
@@ -17,7 +16,7 @@ from acsard.host import processes
 from acsard.host.child import (
     acsard,
 )
-from acsard.host.processes import holder_of, holders, is_running, master_of, name_of, waited_ns
+from acsard.host.processes import holder_of, holders, master_of, name_of, waited_ns
 from tests.each import each
 from tests.system.harness import until
 
@@ -72,16 +71,6 @@ def test_the_holder_of_a_device_is_the_process_with_the_lock(device: str) -> Non
         assert holder.pid == locker
 
 
-def test_without_a_lock_the_holder_is_another_process_with_the_device_open(device: str) -> None:
-    own = os.open(device, os.O_RDWR | os.O_NOCTTY)
-    fcntl.flock(own, fcntl.LOCK_EX)
-    with another(device) as pid:
-        holder = holder_of(device)
-        assert holder is not None
-        assert holder.pid == pid
-    os.close(own)
-
-
 def test_the_other_end_of_a_pty_is_found_and_a_real_device_has_none(device: str) -> None:
     other = master_of(device)
     assert other is not None
@@ -92,14 +81,6 @@ def test_the_other_end_of_a_pty_is_found_and_a_real_device_has_none(device: str)
 @pytest.mark.parametrize("path", ["/dev/acsar_that_is_not", "/etc/passwd", "/tmp"])
 def test_a_path_that_is_not_a_device_has_no_holder(path: str) -> None:
     assert (list(holders(path)), holder_of(path), master_of(path)) == ([], None, None)
-
-
-def test_a_program_is_found_by_its_name_until_it_has_ended(device: str) -> None:
-    with another(device) as pid:
-        (holder,) = [process for process in holders(device) if process.pid == pid]
-        assert is_running(holder.name)
-    assert not is_running("no such program")
-    assert (name_of(os.getpid()) != "", name_of(pid)) == (True, "")
 
 
 @each(

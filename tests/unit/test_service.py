@@ -28,7 +28,6 @@ from acsard.machine.service_installation import (
     UNIT,
     UNIT_DIRECTORY,
     File,
-    InstallCopy,
     Keep,
     Remove,
     Run,
@@ -57,13 +56,6 @@ def test_a_missing_group_or_program_of_the_units_is_reported_with_a_remedy() -> 
 def _wanted(tmp_path: Path) -> list[File]:
     """Return a unit and a first configuration, neither of them written yet."""
     return [File(tmp_path / UNIT, b"unit"), File(tmp_path / "acsard.toml", b"first", kept=True)]
-
-
-def test_a_first_installation_writes_all_files_and_then_runs_the_commands(
-    wanted: list[File],
-) -> None:
-    steps = installing(wanted, force=False)
-    assert steps == [InstallCopy(), *map(Write, wanted), *INSTALL_COMMANDS]
 
 
 def test_the_daemon_starts_before_the_page_whose_unit_mounts_its_directory() -> None:
@@ -153,13 +145,6 @@ def test_a_removal_leaves_what_the_user_may_miss_and_says_so_and_a_purge_leaves_
     assert files_in(machine) == set()
 
 
-def test_a_command_of_another_program_stays(machine: Path) -> None:
-    command = service_installation.COMMAND
-    command.unlink()
-    command.symlink_to("/usr/bin/acsard")
-    assert Remove(command) not in uninstalling(purge=True)
-
-
 def test_the_files_are_those_of_deploy_with_the_port_of_a_real_robot() -> None:
     unit, gateway, page, _, configuration = files()
     assert (unit.path.name, gateway.path.name, page.path.name) == (UNIT, GATEWAY, PAGE)
@@ -181,13 +166,6 @@ DROP_IN = File(
     b"IPAddressAllow=10.0.0.0/8\nLoadCredential=key.pem:/a/b/key.pem\n"
     b"ExecReload=+/bin/sh -c 'cd \"/a/b\" && install key.pem %t/%N'\n",
 )
-
-
-def test_the_drop_in_of_the_gateway_has_the_directory_of_the_certificates() -> None:
-    step = admitted(DROP_IN, None, Path("/srv/tls"))
-    assert isinstance(step, Write)
-    assert b"LoadCredential=key.pem:/srv/tls/key.pem\n" in step.file.content
-    assert b"'cd \"/srv/tls\" && install key.pem %t/%N'\n" in step.file.content
 
 
 def test_networks_that_the_user_has_restricted_are_kept() -> None:
@@ -223,14 +201,6 @@ def test_a_full_disk_leaves_no_part_of_a_file(tmp_path: Path) -> None:
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
     assert not list(tmp_path.iterdir())
-
-
-@pytest.mark.parametrize("words", [("false",), ("sh", "-c", "kill -9 $$")])
-def test_a_command_that_fails_without_a_message_ends_the_installation(
-    words: tuple[str, ...],
-) -> None:
-    with pytest.raises(MendableError, match=words[0]):
-        Run(words).do()
 
 
 def test_a_failing_command_ends_the_installation_unless_its_failure_is_permitted() -> None:

@@ -88,24 +88,6 @@ def test_without_a_manager_nothing_happens(address: str) -> None:
     nobody.close()
 
 
-def test_an_abstract_socket_address_is_accepted() -> None:
-    manager = Manager(f"@acsard-test-{os.getpid()}")
-    try:
-        systemd(manager).ready()
-        assert manager.read_datagrams() == [{"READY": "1"}]
-    finally:
-        manager.close()
-
-
-def test_the_socket_is_not_inherited_by_children(manager: Manager) -> None:
-    before = sockets()
-    there = systemd(manager)
-    (made,) = sockets() - before
-    assert not os.get_inheritable(made)
-    there.close()
-    assert sockets() == before
-
-
 def sockets() -> set[int]:
     """Return the open sockets of this process."""
     descriptors = set()
@@ -180,11 +162,6 @@ def test_a_watchdog_that_is_off_broken_or_another_process_s_is_not_fed(
     assert feeds(manager, systemd(manager, **environment), 10 * MS, 50) == []
 
 
-def test_a_watchdog_with_the_pid_of_this_process_is_fed(manager: Manager) -> None:
-    there = systemd(manager, WATCHDOG_USEC="200000", WATCHDOG_PID=str(PID))
-    assert feeds(manager, there, 10 * MS, 1)
-
-
 # the status
 
 
@@ -257,14 +234,3 @@ def test_a_manager_that_disappears_causes_no_error(manager: Manager) -> None:
     stepped(there, NS_PER_S)
     there.stopping()
     there.close()
-
-
-def test_a_status_that_a_full_queue_refused_is_sent_later(manager: Manager) -> None:
-    there = systemd(manager, WATCHDOG_USEC="200000")
-    fill(there)
-    at = 2000 * NS_PER_S
-    stepped(there, at, mode="stopped", reason="by teleop", changed=True)
-    manager.read_datagrams()
-    for step in range(1, 30):
-        stepped(there, at + step * 100 * MS, mode="stopped", reason="by teleop")
-    assert statuses(manager) == ["stopped: by teleop"]

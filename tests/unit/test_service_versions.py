@@ -14,9 +14,7 @@ import pytest
 from acsard.bus.address import Address
 from acsard.host.errors import MendableError
 from acsard.machine import upgrade, versions
-from acsard.machine.deploy_files import PACKAGED
 from acsard.machine.upgrade import Look, UnitState, configuration_file, prepare, worse
-from tests.system.harness import ROOT
 from tests.unit.screens import STATE
 
 
@@ -128,12 +126,6 @@ def test_the_copy_has_acsard_and_the_libraries_of_its_users_but_no_developer_s()
     assert not {"pytest", "mypy", "hypothesis"} & names
 
 
-def test_the_copy_of_a_clone_has_the_same_files_of_deploy_as_the_wheel() -> None:
-    project = (ROOT / "pyproject.toml").read_text()
-    for name in PACKAGED:
-        assert f'"deploy/{name}" = "acsard/deploy/{name}"' in project
-
-
 def test_a_full_disk_leaves_no_part_of_a_copy(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -225,14 +217,6 @@ def test_a_version_is_worse_without_the_link_or_with_more_missed_periods(
     found = worse(before, after)
     assert why in found
     assert bool(found) is bool(why)
-
-
-@pytest.mark.parametrize(
-    ("state", "runs"),
-    [("active", True), ("activating", True), ("inactive", False), ("failed", False)],
-)
-def test_a_unit_that_is_restarted_again_and_again_counts_as_running(state: str, runs: bool) -> None:
-    assert UnitState(state, 0, 0).runs is runs
 
 
 def test_the_configuration_file_is_the_one_that_the_daemon_s_environment_names() -> None:

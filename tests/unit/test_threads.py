@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import threading
-from collections import deque
 from threading import Thread
 from typing import Any, cast
 
@@ -13,7 +12,7 @@ import pytest
 from acsard.core.values import NS_PER_S
 from acsard.host import clock
 from acsard.host.mailbox import Bell, Mailbox
-from acsard.host.threads import NoThreadError, Worker, future_of, in_thread
+from acsard.host.threads import NoThreadError, future_of, in_thread
 
 NO_ROOM = 1 << 46
 """Stack size that no machine can provide, so that a thread with it cannot start."""
@@ -90,19 +89,6 @@ def test_a_result_that_arrives_after_the_end_of_the_event_loop_is_released() -> 
     assert released.wait(5.0)
 
 
-def test_a_result_that_its_caller_has_received_is_not_released() -> None:
-    released: list[int] = []
-
-    def call() -> int:
-        return 7
-
-    assert asyncio.run(in_thread(call, None, released.append)) == 7
-    for thread in threading.enumerate():
-        if thread.name == "call":
-            thread.join(5.0)
-    assert not released
-
-
 def test_a_future_has_the_result_or_the_error_of_its_call_when_it_wakes_the_caller() -> None:
     def fail() -> int:
         raise ValueError("no number")
@@ -124,26 +110,6 @@ def test_a_future_whose_thread_cannot_be_started_raises_an_error() -> None:
         threading.stack_size(usual)
 
 
-def test_the_error_that_ends_a_worker_is_passed_on() -> None:
-    def fail() -> None:
-        raise ValueError("no number")
-
-    errors: list[BaseException] = []
-    worker = Worker("worker", fail, errors.append)
-    worker.start()
-    worker.join(5.0)
-    assert [str(error) for error in errors] == ["no number"]
-
-
-def test_a_worker_that_cannot_be_started_raises_an_error() -> None:
-    usual = threading.stack_size(NO_ROOM)
-    try:
-        with pytest.raises(NoThreadError, match="cannot start another thread"):
-            Worker("worker", lambda: None).start()
-    finally:
-        threading.stack_size(usual)
-
-
 WAIT_S = 10.0
 
 
@@ -161,13 +127,6 @@ def took_s(begin_ns: int) -> float:
 # the items
 
 
-def test_items_are_returned_once_and_in_the_order_of_arrival() -> None:
-    box = filled(4, 3)
-    assert (len(box.waiting), box.pop(), box.take(), box.take(), box.pop(), len(box.waiting)) == (
-        3, 0, [1, 2], [], None, 0,
-    )  # fmt: skip
-
-
 def test_a_full_mailbox_drops_its_oldest_items_and_reports_each_to_the_writer() -> None:
     box = Mailbox[int](3)
     assert [box.put(number) for number in range(5)] == [True, True, True, False, False]
@@ -175,57 +134,13 @@ def test_a_full_mailbox_drops_its_oldest_items_and_reports_each_to_the_writer() 
     assert box.put(5)
 
 
-class Flooded(deque[int]):
-    """The items of a mailbox. For each item that is taken, another thread adds a new one."""
-
-    def popleft(self) -> int:
-        item = super().popleft()
-        self.append(item + 1)
-        assert item < 100, "the flood holds the reader"
-        return item
-
-
-def test_a_flood_of_items_does_not_block_the_reader() -> None:
-    box = Mailbox[int](3)
-    box.waiting = Flooded([0, 0, 0], maxlen=3)
-    assert box.take() == [0, 0, 0]
-    assert box.take() == [1, 1, 1]
-
-
 # the wake-up
-
-
-def test_an_item_that_arrived_before_the_wait_ends_the_wait_immediately() -> None:
-    box = filled(4, 1)
-    assert box.wait(0.0)
-    assert box.wait(None)
 
 
 def test_a_wait_without_items_ends_after_its_timeout() -> None:
     begin_ns = clock.mono_ns()
     assert not Mailbox[int](4).wait(0.05)
     assert 0.05 <= took_s(begin_ns) < WAIT_S
-
-
-@pytest.mark.parametrize("seconds", [0.0, -1.0])
-def test_a_wait_with_zero_or_negative_timeout_returns_immediately(seconds: float) -> None:
-    assert not Mailbox[int](4).wait(seconds)
-    assert not Bell().wait(seconds)
-
-
-def test_a_wake_up_for_an_item_that_is_gone_does_not_end_a_wait() -> None:
-    box = filled(4, 3)
-    box.take()
-    assert not box.wait(0.01)
-
-
-def test_an_item_ends_a_wait_that_has_begun() -> None:
-    box = Mailbox[int](4)
-    writer = threading.Timer(0.05, box.put, (7,))
-    writer.start()
-    assert box.wait(WAIT_S)
-    assert box.take() == [7]
-    writer.join(WAIT_S)
 
 
 def test_no_wake_up_is_lost_between_concurrent_writers_and_the_reader() -> None:
@@ -247,25 +162,6 @@ def test_no_wake_up_is_lost_between_concurrent_writers_and_the_reader() -> None:
     for thread in threads:
         thread.start()
     assert done.wait(WAIT_S), count
-
-
-def test_an_item_that_is_only_stored_wakes_no_reader() -> None:
-    woken: list[str] = []
-    box = Mailbox[int](4, lambda: woken.append("woken"))
-    assert box.store(1)
-    assert woken == []
-    box.put(2)
-    assert woken == ["woken"]
-    assert box.take() == [1, 2]
-
-
-def test_a_callback_runs_on_the_writer_s_thread_and_finds_the_item() -> None:
-    calls: list[tuple[str, int | None]] = []
-    box = Mailbox[int](4, lambda: calls.append((threading.current_thread().name, box.pop())))
-    writer = Thread(target=box.put, args=(5,), name="writer")
-    writer.start()
-    writer.join(WAIT_S)
-    assert calls == [("writer", 5)]
 
 
 @pytest.mark.parametrize(("items", "closes", "woken"), [(0, False, 0), (2, False, 1), (0, True, 1)])
@@ -305,23 +201,7 @@ def test_a_closed_mailbox_still_returns_its_items_and_never_blocks_its_reader() 
     )
 
 
-def test_closing_the_mailbox_ends_a_wait_that_has_begun() -> None:
-    box = Mailbox[int](4)
-    closer = threading.Timer(0.05, box.close)
-    closer.start()
-    assert box.wait(WAIT_S)
-    closer.join(WAIT_S)
-
-
 # the bell
-
-
-def test_a_bell_that_rang_several_times_ends_only_one_wait() -> None:
-    bell = Bell()
-    for _ in range(3):
-        bell.ring()
-    assert bell.wait(0.0)
-    assert not bell.wait(0.0)
 
 
 def test_two_threads_may_ring_at_the_same_moment() -> None:
