@@ -9,6 +9,7 @@ these commands only.
 from __future__ import annotations
 
 import re
+from functools import cache
 from pathlib import Path
 from textwrap import dedent
 from typing import NamedTuple
@@ -67,6 +68,7 @@ def text_of(page: str) -> str:
     return (ROOT / page).read_text(encoding="utf-8")
 
 
+@cache
 def blocks(*languages: str) -> list[Block]:
     """Return the fenced blocks of all pages in these languages, or in any language."""
     found = []

@@ -24,7 +24,6 @@ from acsard import cli
 from acsard.core.config.settings import Config
 from tests.each import each
 from tests.pages import PAGES, ROOT, Block, blocks, prose, text_of
-from tests.tools.reference import GENERATED
 
 COMMANDS = list(dict.fromkeys(line for block in blocks() for line in block.commands()))
 
@@ -182,79 +181,6 @@ def test_every_file_that_a_recipe_names_is_there() -> None:
     assert not {name for name in named if not exists(name, below=ROOT / "acsard")}
 
 
-def recipe(begin: str, end: str) -> set[str]:
-    """Return the files that the developers' page names between two texts."""
-    part = prose("acsard/README.md").partition(begin)[2].partition(end)[0]
-    return files_in("\n".join(re.findall(r"`([^`\s]+)`", part)))
-
-
-# The built manual, what its build keeps, and pages that explain some things and list none.
-NOT_LISTS = (
-    *("acsard/manual/", "deploy/manual/site/", "deploy/manual/.cache/"),
-    *(f"deploy/manual/pages/{part}/" for part in ("tutorial", "howto", "explanation")),
-)
-
-
-def files_with(pattern: str, *rooms: str) -> set[str]:
-    """Return the files below these directories whose text matches the pattern.
-
-    The names are relative and without `acsard/`, as on the developers' page.
-    """
-    files = [file for room in rooms for file in (ROOT / room).rglob("*") if file.is_file()]
-    texts = [(file, file.read_bytes()) for file in files if file.suffix != ".pyc"]
-    matches = [file for file, text in texts if re.search(pattern.encode(), text)]
-    names = {str(file.relative_to(ROOT)) for file in matches} - set(GENERATED)
-    beyond = {name for name in names if name.startswith(NOT_LISTS)}
-    return {name.removeprefix("acsard/") for name in names - beyond} - {
-        "README.md"  # the recipes themselves
-    }
-
-
-def test_the_recipe_for_a_verb_names_every_file_that_lists_the_verbs() -> None:
-    listed = files_with("reset_odometry", "acsard", "deploy")
-    assert {"core/values.py", "deploy/manual/pages/reference/ros-topics.md"} <= listed
-    with_payload = files_with("set_pose|SetPose", "acsard", "deploy") - {"core/motion/odometry.py"}
-    assert "core/incoming/commands.py" in with_payload
-    assert listed | with_payload <= recipe("## Add a verb", "A subcommand of `acsard`")
-
-
-LISTS_KEYS = r"(?s)^(?=.*\bwheel_states\b)(?=.*\bcmd_vel_out\b)(?=.*\bdiagnostics\b)"
-"""A file that contains three published keys."""
-
-READS_KEYS = {"web/page/main.js"}
-"""Files that name only some of the published keys."""
-
-
-@each(
-    ("part", "pattern", "some", "beyond"),
-    [
-        ("key", LISTS_KEYS, "core/messages/report.py", READS_KEYS),
-        ("key", r"\bInterfaces\b", "core/incoming/queries.py", set()),
-        ("simulated fault", "stuck_encoder", "core/config/named_faults.py", set()),
-        ("setting", "angular_jerk", "core/config/motion_rules.py", {"core/motion/limits.py"}),
-        ("ROS topic", "cmd_vel_teleop", "core/ros/transports.py", set()),
-        ("ROS topic", "sensor_msgs/(msg/)?JointState", "core/ros/channels.py", set()),
-        ("firmware dialect", "trailing_comma", "core/link/codec.py", {"core/codes.py"}),
-    ],
-)
-def test_a_recipe_names_every_file_that_must_change(
-    part: str, pattern: str, some: str, beyond: set[str]
-) -> None:
-    """Compare a recipe's files with the files that match a pattern of its subject.
-
-    `beyond` are files that match this pattern and need no change.
-    """
-    knowing = files_with(pattern, "acsard", "deploy")
-    assert {some, *beyond} <= knowing
-    assert knowing - beyond <= recipe(f"## Add a {part}", "\n## ")
-
-
-def test_the_recipe_for_a_transport_names_every_file_that_names_a_transport() -> None:
-    knowing = files_with('"(rmw|bridge)"', "acsard")
-    assert {"core/ros/transports.py", "daemon/bus/bus.py"} <= knowing
-    assert knowing <= recipe("A third transport", "##")
-
-
 def test_every_file_of_the_tour_is_there() -> None:
     tour = ast.get_docstring(ast.parse((ROOT / "acsard/__init__.py").read_text(encoding="utf-8")))
     assert tour is not None
@@ -271,8 +197,3 @@ def test_the_page_of_the_service_names_every_file_beside_it() -> None:
     assert not {p.name for p in here.iterdir() if f"`{p.name}`" not in text_of(page)} - {
         "README.md"
     }
-
-
-def test_the_page_of_the_tests_names_every_directory_of_tests() -> None:
-    rooms = {p.name for p in (ROOT / "tests").iterdir() if (p / "__init__.py").exists()}
-    assert not {name for name in rooms if f"`{name}/`" not in text_of("tests/README.md")}

@@ -11,6 +11,7 @@ import re
 import subprocess
 import sys
 from collections.abc import Iterator
+from functools import cache
 from itertools import pairwise
 from pathlib import Path
 from typing import get_args
@@ -35,25 +36,36 @@ KINDS = {"CLOCK_MONOTONIC_RAW", "CLOCK_MONOTONIC", "CLOCK_BOOTTIME"}
 # Users see the fields of these types, so they may have a string below them.
 TYPES_OF_USERS = ("core/config/settings.py", "core/messages/schema.py", "web/socket_messages.py")
 
-CODE = {
-    str(path.relative_to(PACKAGE)): path.read_text(encoding="utf-8")
-    for path in sorted(PACKAGE.rglob("*.py"))
-}
-TREES = {module: ast.parse(code, module) for module, code in CODE.items()}
-NODES = {module: list(ast.walk(tree)) for module, tree in TREES.items()}
-
 FUNCTIONS = (ast.FunctionDef, ast.AsyncFunctionDef)
-METHODS = {
-    node.name: {item.name for item in node.body if isinstance(item, FUNCTIONS)}
-    for nodes in NODES.values()
-    for node in nodes
-    if isinstance(node, ast.ClassDef)
-}
+
+
+# Only the process that runs these tests parses the code.
+@cache
+def code() -> dict[str, str]:
+    return {
+        str(path.relative_to(PACKAGE)): path.read_text(encoding="utf-8")
+        for path in sorted(PACKAGE.rglob("*.py"))
+    }
+
+
+@cache
+def nodes() -> dict[str, list[ast.AST]]:
+    return {module: list(ast.walk(ast.parse(text, module))) for module, text in code().items()}
+
+
+@cache
+def methods() -> dict[str, set[str]]:
+    return {
+        node.name: {item.name for item in node.body if isinstance(item, FUNCTIONS)}
+        for all_nodes in nodes().values()
+        for node in all_nodes
+        if isinstance(node, ast.ClassDef)
+    }
 
 
 def imported(module: str) -> Iterator[str]:
     """Yield the dotted names that a module imports anywhere, with `from a import b` as `a.b`."""
-    for node in NODES[module]:
+    for node in nodes()[module]:
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names)
         elif isinstance(node, ast.ImportFrom):
@@ -73,9 +85,9 @@ def test_the_import_contracts_are_kept() -> None:
 def test_a_module_of_the_core_neither_opens_nor_prints() -> None:
     calls = {
         (module, node.func.id)
-        for module in CODE
+        for module in code()
         if module.startswith("core/")
-        for node in NODES[module]
+        for node in nodes()[module]
         if isinstance(node, ast.Call) and isinstance(node.func, ast.Name)
     }
     assert len(calls) > 1000
@@ -83,7 +95,7 @@ def test_a_module_of_the_core_neither_opens_nor_prints() -> None:
 
 
 def test_the_init_of_a_package_imports_nothing() -> None:
-    for module in CODE:
+    for module in code():
         package, _, name = module.rpartition("/")
         if name == "__init__.py" and package not in ("cli", "client"):
             assert list(imported(module)) == [], module
@@ -91,14 +103,14 @@ def test_the_init_of_a_package_imports_nothing() -> None:
 
 def test_only_the_clock_reads_a_clock() -> None:
     """The modules of the daemon share one clock."""
-    for module in CODE:
+    for module in code():
         if module.partition("/")[0] not in ("host", "daemon", "recording"):
             continue
         names = set(imported(module))
         read = {name.removeprefix("time.") for name in names if name.startswith("time.")}
         read |= {
             node.attr
-            for node in NODES[module]
+            for node in nodes()[module]
             if isinstance(node, ast.Attribute) and ast.unparse(node.value) == "time"
         }
         if module == "host/clock.py":
@@ -141,8 +153,8 @@ def parameters(node: ast.AST) -> list[str]:
 
 
 def test_a_docstring_lists_the_arguments_that_the_function_has() -> None:
-    for module, nodes in NODES.items():
-        for node in nodes:
+    for module in code():
+        for node in nodes()[module]:
             if not isinstance(node, (*FUNCTIONS, ast.ClassDef)):
                 continue
             if names := documented(ast.get_docstring(node) or ""):
@@ -156,12 +168,12 @@ def is_string(node: ast.stmt) -> bool:
 
 def superfluous(module: str) -> Iterator[str]:
     """Yield each docstring of a private name or an override, and each string of an assignment."""
-    for node in NODES[module]:
+    for node in nodes()[module]:
         body = getattr(node, "body", None)
         if not isinstance(body, list):
             continue
         bases = {ast.unparse(base).rpartition(".")[2] for base in getattr(node, "bases", ())}
-        silent = set[str]().union(*(METHODS.get(base, ()) for base in bases))
+        silent = set[str]().union(*(methods().get(base, ()) for base in bases))
         for item in body:
             if not isinstance(item, (*FUNCTIONS, ast.ClassDef)) or not is_string(item.body[0]):
                 continue
@@ -174,7 +186,7 @@ def superfluous(module: str) -> Iterator[str]:
 
 
 def test_a_docstring_stands_only_where_it_says_more_than_the_name() -> None:
-    assert [text for module in CODE for text in superfluous(module)] == []
+    assert [text for module in code() for text in superfluous(module)] == []
 
 
 # events
@@ -183,10 +195,10 @@ def test_a_docstring_stands_only_where_it_says_more_than_the_name() -> None:
 def logged() -> set[str]:
     """Return the name of each event and log line in the code."""
     names = set()
-    for module, code in CODE.items():
-        if "Event(" not in code and "log.info(" not in code:
+    for module, text in code().items():
+        if "Event(" not in text and "log.info(" not in text:
             continue
-        for node in NODES[module]:
+        for node in nodes()[module]:
             if isinstance(node, ast.Call) and node.args and isinstance(node.args[0], ast.Constant):
                 called = ast.unparse(node.func)
                 if called.split(".")[-1] == "Event" or called.endswith("log.info"):
@@ -198,8 +210,8 @@ def test_the_names_of_events_are_a_closed_set_that_the_manual_lists() -> None:
     events, names = get_args(EventName), logged()
     assert len(names) > 15
     assert names <= set(events)
-    code = "".join(text for module, text in CODE.items() if module != "core/values.py")
-    assert not {n for n in {*events} - {*get_args(Verb)} if f'"{n}"' not in code}
+    texts = "".join(text for module, text in code().items() if module != "core/values.py")
+    assert not {n for n in {*events} - {*get_args(Verb)} if f'"{n}"' not in texts}
     page = (ROOT / "deploy/manual/pages/reference/events.md").read_text(encoding="utf-8")
     table = page.partition("| meaning | event |")[2].partition("\n\n")[0]
     cells = [row.split("|")[2] for row in table.splitlines()[2:]]

@@ -11,11 +11,9 @@ import gc
 import os
 import select
 import sys
-from contextlib import nullcontext
 from pathlib import Path
 
 import msgspec
-from msgspec.structs import replace
 
 from acsard.core.config.parsing import from_builtins
 from acsard.core.config.settings import Config
@@ -24,18 +22,6 @@ from acsard.daemon.serial.simulator_pty import PtyEnd
 from acsard.host import clock
 from acsard.host.timerfd import TimerFd
 from tests.bench.matching import RecordedTraffic, staircase
-
-
-class Part(msgspec.Struct, frozen=True):
-    """The parameters of the process that simulates the board, as it reads them from a file."""
-
-    config: dict[str, object]
-    free_running: float = 0.0
-    """Period at which the simulated board reports by its own clock, s; 0 for a board that answers
-    lines."""
-    baud_rate: int = 0
-    """Baud rate of the simulated board; 0 means the configured rate. Unlike in a configuration
-    file, any rate is accepted."""
 
 
 class NumberedMcu(FakeMcu):
@@ -102,7 +88,7 @@ class FarEnd:
             self._timer.set(due_ns)
 
 
-def main(part: Part) -> None:
+def main(config: Config) -> None:
     """Simulate the board until standard input ends, then write a `RecordedTraffic` to stdout."""
     try:
         # Other processes must not delay the simulated board: a real one has its own processor.
@@ -110,16 +96,12 @@ def main(part: Part) -> None:
     except OSError:
         # Without real-time priority the times are accurate only on an idle machine.
         pass
-    config = from_builtins(part.config)
-    if part.baud_rate:
-        config = replace(config, mcu=replace(config.mcu, baud_rate=part.baud_rate))
     mcu = NumberedMcu(config, clock.mono_ns())
     end = FarEnd(mcu)
     sys.stdout.write(end.path + "\n")
     sys.stdout.flush()
     gc.disable()
-    with mcu.free_running(part.free_running) if part.free_running else nullcontext():
-        end.play(sys.stdin.fileno())
+    end.play(sys.stdin.fileno())
     try:
         sys.stdout.buffer.write(msgspec.msgpack.encode(end.seen))
         sys.stdout.flush()
@@ -129,4 +111,4 @@ def main(part: Part) -> None:
 
 
 if __name__ == "__main__":
-    main(msgspec.json.decode(Path(sys.argv[1]).read_bytes(), type=Part))
+    main(from_builtins(msgspec.json.decode(Path(sys.argv[1]).read_bytes())))

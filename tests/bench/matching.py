@@ -31,16 +31,6 @@ Chunk = tuple[int, bytes]
 """A pair: a monotonic time, ns, and the bytes that were sent or received at that time."""
 
 
-class MatchedLine(Struct, frozen=True):
-    """A feedback line for which the measured daemon published an odometry sample."""
-
-    delay_ns: int
-    """Time from the board's write of the line to the arrival of the sample at the benchmark, ns."""
-    waiting: int
-    """Number of newer lines that the simulated board had already written when the sample
-    arrived."""
-
-
 def staircase(number: int) -> float:
     """Return the speed of all wheels in the command or feedback line with this number, rad/s.
 
@@ -94,8 +84,8 @@ def commands_to_lines(sent: Sequence[Chunk], lines: Sequence[Chunk]) -> list[int
 
 def lines_to_samples(
     lines: Sequence[tuple[int, float]], samples: Iterable[tuple[int, float]]
-) -> list[MatchedLine]:
-    """Return a `MatchedLine` for each feedback line that became an odometry sample.
+) -> list[int]:
+    """Return the time from each feedback line to its odometry sample, ns.
 
     Lines and samples are matched by their linear speed. A second sample of the same line is
     ignored.
@@ -115,7 +105,7 @@ def lines_to_samples(
         place = bisect_left(indices, before) - 1
         if place >= 0 and indices[place] > last_index:
             last_index = indices[place]
-            matches.append(MatchedLine(at_ns - all_ns[last_index], before - 1 - last_index))
+            matches.append(at_ns - all_ns[last_index])
     return matches
 
 
@@ -161,25 +151,14 @@ class Record(Struct, frozen=True):
         return [line for line in lines if first_ns <= line[0] < last_ns]
 
 
-def command_waits(record: Record, gap_ns: int = 0) -> list[int]:
-    """Return the time from each command to its line on the wire, ns.
-
-    Lost commands have no entry, and neither have commands that came less than `gap_ns` after a
-    line: their lines had to wait.
-    """
-    lines = lines_of(record.seen.from_daemon)
-    all_ns = [at_ns for at_ns, _ in lines]
-
-    def is_free(at_ns: int) -> bool:
-        place = bisect_right(all_ns, at_ns)
-        return not place or at_ns - all_ns[place - 1] >= gap_ns
-
-    sent = [(sent.at_ns, sent.line) for sent in record.sent if is_free(sent.at_ns)]
-    return commands_to_lines(sent, lines)
+def command_waits(record: Record) -> list[int]:
+    """Return the time from each command to its line on the wire, ns. Lost ones have no entry."""
+    sent = [(sent.at_ns, sent.line) for sent in record.sent]
+    return commands_to_lines(sent, lines_of(record.seen.from_daemon))
 
 
-def feedback_fates(config: Config, record: Record) -> list[MatchedLine]:
-    """Return a `MatchedLine` for each feedback line that became an odometry sample."""
+def feedback_delays(config: Config, record: Record) -> list[int]:
+    """Return the time from each feedback line to its odometry sample, ns."""
     codec = Codec(config.mcu.wheels, config.mcu.trailing_comma)
     kinematics = Kinematics(config.drive)
     lines = [

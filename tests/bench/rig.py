@@ -39,7 +39,6 @@ from acsard.host import clock
 from acsard.host.child import end, end_with_parent, environment
 from acsard.host.errors import NoAnswerError, UnreachableError
 from acsard.host.own_identity import sender_id
-from tests.bench.far_end import Part
 from tests.bench.matching import Record, RecordedTraffic, Sample, SentCommand
 
 END_TIMEOUT_S = 5.0
@@ -78,31 +77,16 @@ commands could arrive at the same phase of the daemon's control period."""
 class Rig:
     """Context manager that starts the measured program and waits until it publishes odometry.
 
-    `follow()` and `command()` measure, and `end()` returns the record.
+    `command()` measures, and `end()` returns the record.
 
     Args:
         config: the configuration in `file`.
         file: the configuration file of the measured program.
         command_line: the command line that starts the measured program.
-        port: the option `--port` of the program; "" starts a process that simulates the board on a
-            pty, without which `end()` has no record to return.
-        free_running: period at which the simulated board reports by its own clock, s; 0 simulates a
-            board that answers each line.
-        wire_baud_rate: baud rate of the simulated board; 0 means the configured baud rate.
     """
 
-    def __init__(
-        self,
-        config: Config,
-        file: Path,
-        *,
-        command_line: Sequence[str] = ACSARD,
-        port: str = "",
-        free_running: float = 0.0,
-        wire_baud_rate: int = 0,
-    ) -> None:
-        self._config, self._file, self._command_line, self._port = config, file, command_line, port
-        self._part = Part(effective(config), free_running, wire_baud_rate)
+    def __init__(self, config: Config, file: Path, command_line: Sequence[str] = ACSARD) -> None:
+        self._config, self._file, self._command_line = config, file, command_line
         self._endpoint = config.bus.listen[0]
         self._codec = Codec(config.mcu.wheels, config.mcu.trailing_comma)
         self._kinematics = Kinematics(config.drive)
@@ -114,14 +98,12 @@ class Rig:
         self._arrived: list[tuple[int, bytes]] = []
         self._sent: list[SentCommand] = []
         self._settled_ns = 0
-        self.started_ns = 0  # when the measured program was started
 
     def __enter__(self) -> Self:
         with ExitStack() as stack:
             where = Path(stack.enter_context(TemporaryDirectory(prefix="acsard-bench-")))
             self._log = where / "log"
-            port = self._port or self._start_far_end(stack, where)
-            self._start_program(stack, port)
+            self._start_program(stack, self._start_far_end(stack, where))
             session = self._session = self._wait(self._connect, f"daemon at {self._endpoint}")
             stack.callback(session.close)
             key = full_key(self._config.robot.id, "odom")
@@ -145,7 +127,7 @@ class Rig:
 
     def _start_far_end(self, stack: ExitStack, where: Path) -> str:
         part = where / "part.json"
-        part.write_bytes(msgspec.json.encode(self._part))
+        part.write_bytes(msgspec.json.encode(effective(self._config)))
         far_end = self._far_end = subprocess.Popen(
             [sys.executable, "-m", "tests.bench.far_end", str(part)],
             stdin=subprocess.PIPE,
@@ -165,7 +147,6 @@ class Rig:
         # The measured daemon must not leave files behind, so it writes its latches to the temporary
         # directory.
         env["XDG_STATE_HOME"] = str(self._log.parent)
-        self.started_ns = clock.mono_ns()
         with self._log.open("wb") as log:
             self.process = subprocess.Popen(
                 words,
@@ -213,18 +194,6 @@ class Rig:
 
     def _odometry(self, sample: zenoh.Sample) -> None:
         self._arrived.append((clock.mono_ns(), sample.payload.to_bytes()))
-
-    def follow(self, seconds: float) -> float:
-        """Receive odometry for `seconds` s, and return the daemon's processor use.
-
-        The result is a share of one core, such as 0.1.
-        """
-        began_ns, used_ns = clock.mono_ns(), processor_ns(self.process.pid)
-        end_ns = began_ns + int(seconds * NS_PER_S)
-        while (left_ns := end_ns - clock.mono_ns()) > 0:
-            time.sleep(min(CHECK_PERIOD_S, left_ns / NS_PER_S))
-            self._alive()
-        return self._share(began_ns, used_ns)
 
     def command(self, seconds: float, wheel_speed: Callable[[int], float], seed: int = 1) -> float:
         """Send commands at random intervals for `seconds` s, and return the daemon's processor use.
@@ -284,16 +253,13 @@ class Rig:
                 return Decoder(RobotState).decode(*encoded(reply.ok))
         raise NoAnswerError(f"no answer on {key}")
 
-    def end_program(self) -> None:
-        end(self.process, END_TIMEOUT_S)
-
     def end(self) -> Record:
         """End the measured program and return the record. Do not use the rig afterward."""
         window_ns = (self._settled_ns, clock.mono_ns())
         # Wait for messages that have not arrived yet.
         time.sleep(0.1)
         self._alive()
-        self.end_program()
+        end(self.process, END_TIMEOUT_S)
         assert self._far_end is not None
         wire_data = _recorded_data(self._far_end)
         decoder = Decoder(Odometry)

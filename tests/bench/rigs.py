@@ -18,24 +18,17 @@ from acsard.core.config.settings import (
     BusConfig,
     CommandsConfig,
     Config,
-    ControlConfig,
     FeedbackConfig,
     LimitsConfig,
-    McuConfig,
     RobotConfig,
     Source,
 )
 from acsard.core.config.toml_text import document
-from acsard.core.config.wire_time import wire_ns
-from acsard.daemon.pacing import REPLY_TIME_NS
-from tests.bench.matching import Record, command_waits, feedback_fates, staircase
+from tests.bench.matching import Record, command_waits, feedback_delays, staircase
 from tests.bench.rig import ACSARD, Rig
 
 POLLED = (sys.executable, "-m", "tests.bench.polled")
 """The original driver's method."""
-
-BY_EVENTS = (sys.executable, "-m", "tests.bench.by_events")
-"""A driver as minimal as the polled one, but event-driven like acsard."""
 
 DRAINING = (*POLLED, "--drain")
 """The polled driver with its obvious fix."""
@@ -54,7 +47,7 @@ def trees() -> dict[str, Sequence[str]]:
     }
 
 
-def config(rate: float = 100.0, reply_period: float = 0.0) -> Config:
+def config() -> Config:
     """Return the configuration of a measured daemon, with its own robot id and bus.
 
     The limits are so high that the line after a command has exactly the speeds of the command, and
@@ -64,8 +57,6 @@ def config(rate: float = 100.0, reply_period: float = 0.0) -> Config:
         robot=RobotConfig(f"bench-{os.getpid()}"),
         bus=BusConfig(listen=(free_endpoint(),)),
         commands=CommandsConfig(sources=(Source("bench", 100),)),
-        control=ControlConfig(rate=rate),
-        mcu=McuConfig(reply_period=reply_period),
         feedback=FeedbackConfig(encoders=False),
         limits=LimitsConfig(
             linear_acceleration=100.0,
@@ -91,7 +82,7 @@ def sibling(settings: Config, number: int) -> Config:
     return replace(settings, robot=name, bus=bus)
 
 
-# Settings that the polled program and the event loop read, so their defaults are written too.
+# Settings that the polled program reads, so their defaults are written too.
 READ = {("mcu", "baud_rate"), ("control", "rate")}
 
 
@@ -114,23 +105,12 @@ def chosen(settings: Config) -> dict[str, Any]:
 def rig(
     settings: Config,
     words: Sequence[str] = ACSARD,
-    *,
-    port: str = "",
-    free_running: float = 0.0,
-    wire_baud_rate: int = 0,
 ) -> Iterator[Rig]:
     """Start a program and a simulated board. The body runs when the link between them is up."""
     with TemporaryDirectory(prefix="acsard-bench-") as where:
         file = Path(where) / "acsard.toml"
         file.write_text("\n".join(document(chosen(settings))) + "\n", encoding="utf-8")
-        with Rig(
-            settings,
-            file,
-            command_line=words,
-            port=port,
-            free_running=free_running,
-            wire_baud_rate=wire_baud_rate,
-        ) as running:
+        with Rig(settings, file, words) as running:
             yield running
 
 
@@ -141,17 +121,9 @@ def driven(settings: Config, words: Sequence[str], seconds: float, seed: int) ->
         return running.end()
 
 
-def waits_us(record: Record, gap_ns: int = 0) -> list[float]:
-    """Return the time from each command to the first byte of its line on the port, in us.
-
-    Commands that came less than `gap_ns` after a line have no entry.
-    """
-    return [wait / 1000 for wait in command_waits(record, gap_ns)]
-
-
-def gap_ns(settings: Config) -> int:
-    """Return the least time between two lines that the daemon keeps."""
-    return wire_ns(settings.mcu.line_bytes, settings.mcu.baud_rate) + REPLY_TIME_NS
+def waits_us(record: Record) -> list[float]:
+    """Return the time from each command to the first byte of its line on the port, in us."""
+    return [wait / 1000 for wait in command_waits(record)]
 
 
 def delays_us(settings: Config, record: Record) -> list[float]:
@@ -159,7 +131,7 @@ def delays_us(settings: Config, record: Record) -> list[float]:
 
     The odometry counts when this process receives it from the bus.
     """
-    return [fed.delay_ns / 1000 for fed in feedback_fates(settings, record)]
+    return [delay / 1000 for delay in feedback_delays(settings, record)]
 
 
 def share(values: Sequence[float], part: float) -> float:

@@ -1,4 +1,4 @@
-"""Compare acsard with the original driver's method and with a minimal event loop.
+"""Compare acsard with the original driver's method.
 
     pytest -s -m bench tests/bench/test_side_by_side.py
 
@@ -11,10 +11,6 @@ The polled program (`polled.py`) acts only at its 100 Hz tick, so a command wait
 average. After one late reply it always reads the line before the newest one. Its option `--drain`
 corrects that, and the test measures this variant too. On a busy machine the ratios of latencies are
 smaller, because every program waits longer for a core. The asserted ratios allow for that.
-
-The event loop (`by_events.py`) is the least program that has real-time scheduling, sends early
-lines with the same gap and publishes in a thread. "Free wire" counts only the commands that came
-when this gap was over.
 """
 
 from __future__ import annotations
@@ -26,16 +22,14 @@ from statistics import median
 
 import pytest
 
-from tests.bench.matching import feedback_fates, staircase
-from tests.bench.rig import ACSARD, SPACING_S
+from tests.bench.matching import staircase
+from tests.bench.rig import SPACING_S
 from tests.bench.rigs import (
-    BY_EVENTS,
     DRAINING,
     POLLED,
     config,
     delays_us,
     driven,
-    gap_ns,
     rig,
     share,
     sibling,
@@ -78,26 +72,22 @@ def times_as_long(what: str, ratio: list[list[float]], other: list[list[float]])
 
 
 def test_commands_and_feedback_are_many_times_faster_than_polled() -> None:
-    ways = trees() | {"by events": BY_EVENTS, "polled": POLLED, "polled, draining": DRAINING}
+    ways = trees() | {"polled": POLLED, "polled, draining": DRAINING}
     waits: Turns = {name: [] for name in ways}
-    free: Turns = {name: [] for name in ways}
     delays: Turns = {name: [] for name in ways}
     for number in range(ROUNDS):
         for name, words in ways.items():
             settings = config()
             record = driven(settings, words, SECONDS, seed=number)
             waits[name].append(waits_us(record))
-            free[name].append(waits_us(record, gap_ns(settings)))
             delays[name].append(delays_us(settings, record))
     head = f"{ROUNDS} turns of {SECONDS:g} s each, us"
     print(f"\n{head:44}  count      p50      p90      p99      max")
     slower = []
-    tables = {"command -> wire": waits, "command -> free wire": free}
-    for what, turns in (tables | {"feedback -> odometry": delays}).items():
+    tables = {"command -> wire": waits, "feedback -> odometry": delays}
+    for what, turns in tables.items():
         for name in ways:
             print(line(f"{what}: {name}", [value for turn in turns[name] for value in turn]))
-        for name in trees():
-            times_as_long(f"  {name} than by events", turns[name], turns["by events"])
         times_as_long("  polled, draining than acsard", turns["polled, draining"], turns["acsard"])
         slower.append(times_as_long("  polled than acsard", turns["polled"], turns["acsard"]))
     if min(slower) < PROMISED:
@@ -121,7 +111,7 @@ def test_what_a_commanded_robot_costs_at_the_same_time_as_polled() -> None:
 
     Other programs of the machine then slow both equally. The test limits the ratio.
     """
-    ways = trees() | {"by events": BY_EVENTS}
+    ways = trees()
     pairs: dict[str, list[tuple[float, float]]] = {name: [] for name in ways}
     for number in range(PAIRS):
         for name, words in ways.items():
@@ -136,38 +126,4 @@ def test_what_a_commanded_robot_costs_at_the_same_time_as_polled() -> None:
             f"  {name:10}{ours:5.1f} % of a core beside {theirs:.1f} %, {ratios[name]:.2f} times "
             f"polled ({len(shares)} pairs, from {by_pair[0]:.2f} to {by_pair[-1]:.2f})"
         )
-    # Even a driver without decisions needs the time of the wake-ups and of the hand-over.
-    assert ratios["by events"] < ratios["acsard"] < 5.0
-
-
-def standing(waiting: list[int], per_second: int) -> list[int]:
-    """Return the smallest number of waiting newer lines in each second of samples.
-
-    A stall of the machine makes lines wait only once, so the minimum hides it. A real backlog
-    remains.
-    """
-    seconds = [waiting[i : i + per_second] for i in range(0, len(waiting), per_second)]
-    return [min(second) for second in seconds if len(second) == per_second]
-
-
-def test_a_faster_microcontroller_leaves_no_backlog_here_and_a_growing_one_there() -> None:
-    hz, seconds = 110.0, 20.0
-    backlog: dict[str, list[int]] = {}
-    for name, words in (("acsard", ACSARD), ("polled", POLLED)):
-        setup = config(reply_period=1 / hz)
-        with rig(setup, words, free_running=1 / hz) as running:
-            running.follow(seconds)
-            record = running.end()
-        fates = feedback_fates(setup, record)
-        waiting = [fed.waiting for fed in fates]
-        backlog[name] = standing(waiting, 100)
-        over = sum(count > 1 for count in waiting)
-        print(
-            f"\n{name}: microcontroller at {hz:g} Hz, host at {setup.rate_hz:g} Hz, {seconds:g} s: "
-            f"{len(record.feedback_lines)} lines, {len(fates)} told\n"
-            f"  backlog by the second, lines: {' '.join(map(str, backlog[name]))}\n"
-            f"  more than one newer line waiting: {over} of {len(fates)} samples; "
-            f"the last line took {fates[-1].delay_ns / 1e6:.1f} ms"
-        )
-    assert max(backlog["acsard"]) <= 1
-    assert backlog["polled"][-1] >= 0.05 * hz * seconds
+    assert ratios["acsard"] < 5.0

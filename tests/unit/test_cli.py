@@ -105,16 +105,6 @@ def test_an_argument_that_no_message_could_contain_is_refused(
     assert ("longer than 4096 characters" in text) == (len(word) > 1)
 
 
-@each("name", ["STATE_DIRECTORY", "XDG_STATE_HOME", "HOME", "ACSARD_CONFIG"])
-def test_a_path_in_the_environment_that_is_not_utf_8_is_refused(
-    name: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    with pytest.MonkeyPatch.context() as patched:
-        patched.setenv(name, "/var/lib/\udce4")
-        assert main(["--config", "/missing"]) == Exit.USAGE
-    assert f"the environment variable {name} is not valid UTF-8" in capsys.readouterr().err
-
-
 # Each takes 1 to 20 ms of processor time to load.
 SLOW = {
     "acsard.bus.access", "acsard.core.incoming.queries", "acsard.core.messages.json_schema",

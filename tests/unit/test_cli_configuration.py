@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import argparse
-import os
 import sys
 from collections.abc import Callable, Iterable
 from pathlib import Path
 
-import msgspec
 import pytest
 
 from acsard.cli import parser, run
@@ -16,10 +14,10 @@ from acsard.cli.check import main
 from acsard.cli.common import load, overrides, with_record_directory
 from acsard.cli.connection import require_readable, robot_address
 from acsard.client.connection import open_connection
-from acsard.core.config.parsing import from_builtins, parse
+from acsard.core.config.parsing import parse
 from acsard.core.config.settings import Config, McuConfig, WebConfig
 from acsard.host import config_file
-from acsard.host.config_file import SEARCH_PATHS, find, writable
+from acsard.host.config_file import SEARCH_PATHS, find
 from acsard.host.errors import Exit, MendableError, UnreachableError, UsageError
 from acsard.host.version import version
 from acsard.machine.doctor import OPTION_KEYS
@@ -111,13 +109,6 @@ def address_of(
     return where.endpoint, where.robot_id, where.tls
 
 
-def test_a_tool_talks_to_the_robot_of_the_configuration(places: Places) -> None:
-    places.option.write_text(
-        '[robot]\nid = "r7"\n[bus]\nlisten = ["tcp/[::1]:9", "tcp/127.0.0.1:8"]\n'
-    )
-    assert address_of(places.option) == ("tcp/[::1]:9", "r7", "")
-
-
 def test_the_options_of_a_tool_win_over_the_configuration(places: Places) -> None:
     places.fill()
     assert address_of(places.option, "tcp/10.0.0.1:1", "r8") == ("tcp/10.0.0.1:1", "r8", "")
@@ -172,16 +163,6 @@ def test_the_record_directory_is_from_the_option_the_file_or_the_service_in_this
     assert directories == ["/option", "/file", "/service"]
 
 
-def test_a_file_that_this_user_may_not_write_is_refused_before_the_work(
-    places: Places, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    places.here.write_text("")
-    # Root may write everywhere.
-    monkeypatch.setattr(os, "access", lambda *_: False)
-    with pytest.raises(MendableError, match="was not changed: it is read-only"):
-        writable(None)
-
-
 def test_a_good_file_is_printed_with_its_place_and_its_warnings(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -192,15 +173,6 @@ def test_a_good_file_is_printed_with_its_place_and_its_warnings(
     assert out.startswith(f"# effective configuration from {file}\n")
     assert parse(out.encode()) == parse(file.read_bytes())
     assert err.startswith(f"{file}: warning: control.rate = 29 ")
-
-
-def test_a_good_file_is_printed_as_json_on_request(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    file = tmp_path / "robot.toml"
-    file.write_text('[robot]\nid = "r7"\n')
-    assert main(argparse.Namespace(config=str(file), json=True)) == 0
-    assert from_builtins(msgspec.json.decode(capsys.readouterr().out)) == parse(file.read_bytes())
 
 
 def given_by(words: Iterable[str]) -> dict[str, object]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable
 from pathlib import Path
 
@@ -62,14 +61,3 @@ def test_the_ports_and_what_looks_like_a_board_are_told_in_the_approved_words(
         out, err = capsys.readouterr()
         text += f"--- {len(found)} ports, exit {code}\n{out}{err}"
     approved(Path(__file__).with_name("words") / "ports.txt", text)
-
-
-def test_json_has_no_control_characters_from_the_description_of_a_device(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    port = replace(UNKNOWN, description="USB \x9b2J Serial")
-    monkeypatch.setattr("acsard.cli.ports.serial_devices", lambda: [port])
-    assert main(["ports", "--json"]) == 0
-    out = capsys.readouterr().out
-    assert out.strip().isprintable()
-    assert json.loads(out)[0]["description"] == port.description

@@ -114,14 +114,6 @@ def test_without_a_prompt_an_optional_number_is_0_and_a_required_one_is_an_error
         Prompt().number(DISTANCE)
 
 
-@pytest.mark.parametrize(("as_json", "output"), [(False, "robot acsar\n"), (True, "")])
-def test_the_subject_is_not_printed_if_the_output_is_one_json_object(
-    as_json: bool, output: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    TerminalPrompt(as_json).begin("robot acsar")
-    assert capsys.readouterr().out == output
-
-
 def test_a_row_has_the_verdict_the_meaning_and_the_remedy() -> None:
     finding = Finding("watchdog", "FAIL", "none", "it drives on " * 20, "give it one")
     head, *rest = plain(row(finding), width=100).splitlines()

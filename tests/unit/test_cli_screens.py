@@ -34,7 +34,7 @@ from acsard.top.drive_screen import Teleop
 from acsard.top.fleet_table import table
 from acsard.top.screen import MODE_STYLES, ScreenData, rate
 from tests.each import each
-from tests.unit.screens import INFO, MEASURED, SEEN, STATE, UNMEASURED, drawn, lines_of, of, painted
+from tests.unit.screens import INFO, SEEN, STATE, UNMEASURED, drawn, lines_of, of
 
 WORDS = Path(__file__).with_name("words")
 
@@ -170,14 +170,6 @@ def test_a_usual_screen_fits_80_by_24() -> None:
     assert len(lines_of(of(sources=five, counters=counters, refused=refused))) <= 24
 
 
-def test_the_screen_of_a_drive_does_not_move_while_figures_change() -> None:
-    still = replace(STATE, x=0.0, y=0.0, yaw=0.0, linear=0.0, angular=0.0)
-    moved = replace(STATE, x=-123.456, y=99.9, yaw=-3.1, linear=-0.55, angular=1.25)
-    shown = [drawn(drive_screen.screen(replace(TELEOP, state=each))) for each in (still, moved)]
-    lengths = [[len(line.rstrip()) for line in text.split("\n")] for text in shown]
-    assert lengths[0] == lengths[1]
-
-
 # robots of a fleet
 
 ROW = Row("robot1", True, replace(STATE, reason="commanded by app"), 0.1)
@@ -193,20 +185,6 @@ def harmless(sent: str) -> bool:
     """Return whether the only control sequences in this text are colours and line ends."""
     rest = re.sub(r"\x1b\[[0-9;]*m", "", sent).replace("\n", "")
     return all(sign.isprintable() for sign in rest)
-
-
-def test_a_hostile_text_changes_only_its_own_field() -> None:
-    state = replace(
-        STATE, mode=HOSTILE, reason=HOSTILE, link=HOSTILE, source=HOSTILE, refused=HOSTILE,
-        certificate_expiry=HOSTILE, sources=[SourceState(HOSTILE, 1, 0.0, HOSTILE, "late")],
-        counters={f"line_{HOSTILE}": 1}, latencies={HOSTILE: MEASURED},
-    )  # fmt: skip
-    info = replace(INFO, port=HOSTILE, version=HOSTILE)
-    hostile = ScreenData(HOSTILE, HOSTILE, state, info=info)
-    assert harmless(painted(hostile))
-    text = "\n".join(lines_of(hostile))
-    assert text.count("[red]") >= 7
-    assert "last minute" in text
 
 
 anything = st.text(max_size=120) | st.just(HOSTILE)

@@ -22,7 +22,7 @@ from acsard.core.values import Event
 from acsard.host import extras
 from acsard.host.extras import Extra, install
 from acsard.host.logs import Log
-from acsard.host.terminal_modes import may_use_color, single_key_mode
+from acsard.host.terminal_modes import single_key_mode
 from acsard.host.version import commit_of, full_version, order, source_of
 from tests.each import each
 
@@ -174,14 +174,6 @@ def _terminal(monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[int, TextIO]]:
     with os.fdopen(theirs, "w") as stream:
         yield ours, stream
     os.close(ours)
-
-
-@pytest.mark.parametrize(("name", "value"), [("NO_COLOR", "1"), ("TERM", "dumb")])
-def test_the_environment_can_disable_colours(
-    terminal: tuple[int, TextIO], monkeypatch: pytest.MonkeyPatch, name: str, value: str
-) -> None:
-    monkeypatch.setenv(name, value)
-    assert not may_use_color(terminal[1])
 
 
 @pytest.mark.parametrize("wanted", [True, False])

@@ -341,14 +341,6 @@ def zeros_of(world: World, idle_s: float | None = None) -> float:
     return world.passed
 
 
-def test_zeros_are_repeated_until_the_state_shows_rest() -> None:
-    world = World(lambda t, last, sent: replace(FOLLOWED, linear=0.3 if t < 1.0 else 0.0))
-    assert 1.0 < zeros_of(world) < 1.5
-    assert set(world.sent) == {0.0}
-    assert len(world.sent) > 20
-    assert not world.subscribed
-
-
 @each(
     ("says", "is_sent"),
     [

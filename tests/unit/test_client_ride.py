@@ -7,7 +7,6 @@ from msgspec.structs import replace
 from acsard.client.follower import ROBOT_SILENCE_TIMEOUT_S, SETTLED_S, Follower
 from acsard.client.ride import (
     MAX_SOURCE_TIMEOUT_S,
-    OPEN_TIMEOUT_S,
     OPENING_PERIOD_S,
     SEND_PERIOD_S,
     SLOWS_S,
@@ -97,14 +96,6 @@ def test_a_short_silence_of_a_robot_that_follows_does_not_interrupt_the_speed() 
     rider.shows = None
     assert set(rider.wish(AHEAD, ROBOT_SILENCE_TIMEOUT_S - 0.2)) == {AHEAD}
     assert rider.wish(AHEAD, 0.5)[-1] == REST
-
-
-def test_a_robot_that_never_accepts_the_zeros_ends_the_ride() -> None:
-    rider = Rider(replace(RESTING, mode="ready", source="", reason="nav drives"))
-    rider.wish(AHEAD, OPEN_TIMEOUT_S - 0.1)
-    assert rider.ride.ended == ""
-    rider.wish(AHEAD, 0.2)
-    assert rider.ride.ended
 
 
 # the zeros at the end

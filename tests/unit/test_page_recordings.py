@@ -12,7 +12,7 @@ import pytest
 from acsard.recording.file import FrameWriter, Head
 from acsard.web.answers import TroubleError
 from acsard.web.callers import RequestRefusedError
-from acsard.web.recordings import BlackBox, Recording, files, rows
+from acsard.web.recordings import BlackBox, Recording, rows
 
 
 def test_a_file_that_the_daemon_deletes_meanwhile_does_not_hide_the_others(
@@ -32,12 +32,6 @@ def test_a_recording_is_listed_with_its_beginning_and_its_duration(tmp_path: Pat
     os.utime(path)
     (row,) = rows([path])
     assert row.being_recorded
-
-
-def test_a_file_in_place_of_the_directory_is_an_error(tmp_path: Path) -> None:
-    (tmp_path / "record").write_text("")
-    with pytest.raises(NotADirectoryError):
-        files(tmp_path / "record", "acsar")
 
 
 @pytest.mark.parametrize("recorded", ["acsar", "robot2"])

@@ -240,14 +240,6 @@ def samples(session: zenoh.Session) -> list[zenoh.Sample]:
     return [subscriber.recv(), subscriber.recv()]
 
 
-def test_an_answer_is_the_value_until_a_message_is_published(samples: list[zenoh.Sample]) -> None:
-    stream = Stream()
-    stream.answered(samples[0])
-    assert stream.value()[:2] == (1, b"1")
-    stream.take(samples[1])
-    assert stream.value()[:2] == (2, b"2")
-
-
 def test_an_answer_older_than_a_published_message_is_ignored(samples: list[zenoh.Sample]) -> None:
     stream = Stream()
     stream.take(samples[1])
