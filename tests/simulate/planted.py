@@ -31,8 +31,7 @@ from typing import NamedTuple
 from tests.simulate import board_inputs
 from tests.simulate.actors import REPLAYED, played
 from tests.simulate.plan import Plan, make_plan
-from tests.simulate.planted_cases import CASES
-from tests.simulate.planted_faults import FAULTS, Fault
+from tests.simulate.planted_faults import CASES, FAULTS, Fault
 
 ROOT = Path(__file__).parents[2]
 TABLE = Path(__file__).with_name("PLANTED.md")

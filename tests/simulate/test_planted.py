@@ -9,8 +9,7 @@ import pytest
 
 from tests.simulate import planted
 from tests.simulate.planted import CASE_MINUTES, FAULT_MINUTES, TABLE, edited, read, text_of
-from tests.simulate.planted_cases import CASES
-from tests.simulate.planted_faults import FAULTS, PLANS_OF_FAULT, Fault
+from tests.simulate.planted_faults import CASES, FAULTS, PLANS_OF_FAULT, Fault
 
 ALL = (*FAULTS, *CASES)
 
@@ -61,7 +60,7 @@ def test_each_promise_is_broken_by_a_planted_fault() -> None:
 def test_a_change_of_a_judge_changes_the_version() -> None:
     """Each module of the simulator is hashed, unless it cannot change the finding of a seed."""
     beside = {"__init__", "__main__", "differences", "pairs", "shrink", "unjudged"}
-    planting = {"planted", "planted_cases", "planted_faults"}
+    planting = {"planted", "planted_faults"}
     modules = {path.stem for path in TABLE.parent.glob("*.py")}
     tests = {name for name in modules if name.startswith("test_")}
     assert modules - beside - planting - tests == set(planted.MEASURED_WITH)
