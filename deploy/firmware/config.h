@@ -1,6 +1,6 @@
 /* Everything that depends on the robot: pins, encoders, motors, gains, times, the serial line.
  *
- * It is written for the ATmega2560 at 16 MHz (Arduino Mega 2560). README.md says which values to
+ * It is written for the ATmega2560 at 16 MHz (Arduino Mega 2560). The manual (howto/flash) says which values to
  * measure and change. No other file needs a change for another robot with the same wiring.
  */
 #ifndef CONFIG_H
@@ -51,7 +51,7 @@
 #define RUNAWAY_MS 150         /* ... without getting slower for this long */
 #define STUCK_MS 1000          /* or it stands at full voltage for this long */
 
-/* Inputs. The board reports those that are wired in its status line; README.md, "Wire the inputs". */
+/* Inputs. The board reports those that are wired in its status line; the manual, howto/inputs. */
 
 #ifndef ESTOP_INPUT
 #define ESTOP_INPUT 0          /* 1: a normally-closed contact of the emergency stop is wired */

@@ -73,7 +73,7 @@ def _run(words: Sequence[str | Path], cwd: Path) -> str:
 
 
 def build_firmware(where: Path, *defines: str) -> Path:
-    """Build the firmware with the README's command, print its size, and return the ELF file."""
+    """Build the firmware with the manual's command, print its size, and return the ELF file."""
     out = _run(["make", f"BUILD={where}", f"DEFINES={' '.join(defines)}"], FIRMWARE)
     print(*(line for line in out.splitlines() if "Full" in line), sep="\n")
     return where / "firmware.elf"

@@ -2,7 +2,7 @@
  *
  * runner [--baud N] [--free-speed A,B,C,D] [--lag SECONDS] [--deadband DUTY] [--counts N] FIRMWARE.elf
  *
- * It is wired as deploy/firmware/README.md says, from numbers of its own: an error in the firmware's
+ * It is wired as the page howto/wire of the manual says, from numbers of its own: an error in the firmware's
  * pins is not repeated here. Time is the wall clock's, in slices of half a millisecond; a machine too
  * slow for that is not caught up with for more than CATCH_UP_NS, the rest is skipped and counted.
  *

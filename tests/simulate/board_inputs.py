@@ -1,11 +1,10 @@
 """Plans whose board reports inputs, and the judge of the promises about them.
 
 The inputs are the emergency stop, bumpers, motor drivers and the battery.
-`deploy/firmware/README.md` defines the status lines. `Inputs` reads the same bytes as the daemon
-and handles each line at the step in which the daemon reads it. If the documentation leaves open
-whether a line or a silence counts, `Inputs` judges nothing.
-
-These plans have separate random generators, so the plans without inputs stay the same.
+`reference/status-line.md` of the manual defines the lines. `Inputs` reads the same bytes as the
+daemon and handles each line at the step in which the daemon reads it. If the documentation leaves
+open whether a line or a silence counts, `Inputs` judges nothing. These plans have separate random
+generators, so the plans without inputs stay the same.
 """
 
 from __future__ import annotations

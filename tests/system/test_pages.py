@@ -97,7 +97,7 @@ def test_the_commands_of_a_page_work_and_print_what_it_shows(page: str, desk: Pa
 def test_the_flash_of_the_firmware_page_calls_avrdude_with_its_port() -> None:
     if shutil.which("make") is None:
         pytest.skip("no make")
-    command = find("deploy/firmware/README.md", "make flash").replace("make", "make -n", 1)
+    command = find("deploy/manual/pages/howto/flash.md", "make flash").replace("make", "make -n", 1)
     done = finish(command.split(), ROOT / "deploy/firmware")
     assert done.code == 0, done
     assert re.search(r"avrdude .*-P /dev/ttyACM0 .*firmware\.hex", done.out)

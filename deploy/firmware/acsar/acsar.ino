@@ -1,5 +1,5 @@
 // Firmware for an Arduino Mega 2560, four motors at drivers like the L298N, and four quadrature encoders.
-// Wiring: wiring.svg. The lines: deploy/firmware/README.md, "A board with firmware of its own".
+// The manual has its wiring (howto/wire) and its lines (reference/line).
 #include <avr/wdt.h>
 
 const long BAUD_RATE = 115200;     // mcu.baud_rate in acsard.toml
