@@ -25,12 +25,10 @@ from cryptography.hazmat.primitives.serialization import (
 )
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
-from acsard.bus import tls as bus_tls
 from acsard.cli import main
 from acsard.core.config.parsing import parse
 from acsard.host.errors import Exit
 from acsard.host.own_identity import own_addresses
-from tests.each import each
 
 ROLES = ("viewer", "operator", "maintainer")
 
@@ -214,16 +212,6 @@ def test_add_issues_one_certificate_by_the_same_authority_and_changes_no_file(ow
     assert abs(left - timedelta(days=7)) < timedelta(minutes=10)
 
 
-@pytest.mark.slow
-@each("name", ["anna.meyer", "10.0.0.5", "2001:db8::9", "anna b.meyer"])
-def test_a_certificate_whose_name_looks_like_a_host_is_valid_and_names_its_owner(
-    own: Path, name: str
-) -> None:
-    """Zenoh's access rules know a client by its certificate's common name."""
-    assert tls("add", name, "--directory", str(own)) == 0
-    assert bus_tls.common_name(str(own / "clients" / name)) == name
-
-
 # printed output
 
 
@@ -311,20 +299,6 @@ def test_without_permission_it_ends_with_77_and_says_how_to_get_it(
 
 
 # the configuration that `tls init` writes
-
-
-def test_init_keeps_a_configuration_s_line_ends_link_and_mode(tmp_path: Path) -> None:
-    real, link = tmp_path / "real.toml", tmp_path / "acsard.toml"
-    real.write_bytes(b"# mine\r\n[robot]\r\nid = 'r1'\r\n")
-    real.chmod(0o640)
-    link.symlink_to("real.toml")
-    assert tls("init", "--directory", str(tmp_path / "tls"), "--write", str(link)) == 0
-    text = real.read_bytes()
-    assert link.is_symlink()
-    assert real.stat().st_mode & 0o777 == 0o640
-    assert text.startswith(b"# mine\r\n[robot]\r\nid = 'r1'\r\n")
-    assert text.count(b"\r\n") == text.count(b"\n")
-    assert parse(text).bus.tls == str(tmp_path / "tls")
 
 
 @pytest.mark.parametrize("name", ["", "robot4"])

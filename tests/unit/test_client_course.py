@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import math
 from collections import deque
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 
 from acsard.client.course import Course, Straight, Turn
+from acsard.client.driving import Driver, Steps, move, turn
 from acsard.core.messages.report import from_yaw
 from acsard.core.messages.schema import (
     Header,
@@ -20,7 +23,11 @@ from acsard.core.messages.schema import (
     Vector3,
 )
 from acsard.core.values import REST
+from acsard.host import clock
+from acsard.host.errors import NoAnswerError, NotDrivenError
 from tests.each import each
+from tests.unit.screens import sample_of
+from tests.unit.test_client_driving import World, followed
 
 PERIOD_S = 0.01
 
@@ -74,9 +81,105 @@ def test_a_turn_ends_within_half_a_degree(degrees: float, delay_s: float) -> Non
     assert math.degrees(robot.yaw - 3.0) == pytest.approx(degrees, abs=0.5)
 
 
-def test_a_robot_that_is_pushed_aside_on_a_straight_course_turns_back() -> None:
-    robot = Robot(0.05)
-    course = Straight(robot.odom(), 1.0, 0.3)
-    robot.yaw = 0.3
-    robot.follow(course)
-    assert robot.yaw == pytest.approx(0.0, abs=0.02)
+@pytest.fixture(autouse=True)
+def _clock(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let the clock that also advances during a suspend show the time of the newest world."""
+    monkeypatch.setattr(clock, "steady_s", lambda: World.newest.now)
+
+
+class WithOdometry(World):
+    """A robot that publishes its odometry for some time, and does not move."""
+
+    def __init__(self, seconds: float) -> None:
+        super().__init__(followed)
+        self.body = Robot(0.0)
+        self._odometry_s = seconds
+
+    def subscribe(self, name: str) -> Any:
+        if name == "state":
+            return super().subscribe(name)
+        queue: list[Any] = []
+
+        def receive() -> Any:
+            if not queue and self.passed < self._odometry_s:
+                queue.extend([sample_of(self.body.odom(), "acsard/acsar/odom"), None])
+            return queue.pop(0) if queue else None
+
+        return SimpleNamespace(try_recv=receive, undeclare=lambda: None)
+
+    def move(self) -> None:
+        robot: Any = self
+        for pause in move(1.0, 0.3)(Driver(robot)):
+            self.now += pause
+
+
+def test_a_move_without_odometry_ends_before_it_began() -> None:
+    world = WithOdometry(0.0)
+    with pytest.raises(NoAnswerError, match="no odometry arrives"):
+        world.move()
+    assert world.sent == []
+
+
+def test_a_move_stops_when_the_odometry_falls_silent() -> None:
+    world = WithOdometry(1.0)
+    with pytest.raises(NoAnswerError, match="no odometry arrives"):
+        world.move()
+    assert 0.3 in world.sent
+    # The error comes 2 s after the last message, and zeros from 0.2 s after it until rest.
+    assert next(n for n, speed in enumerate(reversed(world.sent)) if speed) >= 10
+
+
+def test_a_move_of_a_robot_that_does_not_move_ends_after_three_seconds() -> None:
+    world = WithOdometry(60.0)
+    with pytest.raises(NotDrivenError, match=r"no nearer for 3 s, and 1\.000 m is left"):
+        world.move()
+    assert 3.0 < world.passed < 4.0
+
+
+class Rolling(WithOdometry):
+    """A robot that follows each command at once."""
+
+    def __init__(self) -> None:
+        super().__init__(math.inf)
+        self.linear = self.angular = self.way = self.turned = 0.0
+
+    def send(self, linear: float, angular: float = 0.0) -> None:
+        super().send(linear, angular)
+        self.linear, self.angular = linear, angular
+
+    def follow(self, steps: Steps, is_set: float = math.inf) -> None:
+        """Drive a course, for at most 1000 s. After `is_set` s, the odometry is reset."""
+        robot: Any = self
+        body = self.body
+        for pause in steps(Driver(robot)):
+            self.now += pause
+            assert self.now < 1100.0
+            self.way += self.linear * pause
+            self.turned += self.angular * pause
+            body.x += self.linear * math.cos(body.yaw) * pause
+            body.y += self.linear * math.sin(body.yaw) * pause
+            body.yaw += self.angular * pause
+            if self.passed >= is_set:
+                body.x, body.y, body.yaw, is_set = 0.0, 0.0, 0.0, math.inf
+
+
+def test_a_long_way_at_a_low_speed_is_driven_to_its_end() -> None:
+    world = Rolling()
+    world.follow(move(20.0, 0.05))
+    assert world.way == pytest.approx(20.0, abs=0.01)
+    world = Rolling()
+    world.follow(turn(3600.0, 0.2))
+    assert world.turned == pytest.approx(20 * math.pi, abs=0.02)
+
+
+def test_a_course_ends_if_the_pose_is_set_on_the_way() -> None:
+    # From (3, -2) to (0, 0): the robot would drive 4.5 m in place of 1 m.
+    world = Rolling()
+    with pytest.raises(NotDrivenError, match="the pose was set"):
+        world.follow(move(1.0, 0.3), is_set=2.0)
+    assert world.way < 0.7
+    world = Rolling()
+    world.body.x, world.body.y, world.body.yaw = 0.0, 0.0, 2.0
+    with pytest.raises(NotDrivenError, match="the pose was set"):
+        world.follow(turn(90.0, 0.8), is_set=1.0)
+    assert world.turned < 1.0

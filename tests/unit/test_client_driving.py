@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator
-from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -13,12 +12,10 @@ from msgspec.structs import replace
 
 from acsard.client.driving import (
     Driver,
-    Steps,
     UnheardError,
     drive,
     move,
     repeat_zeros,
-    turn,
 )
 from acsard.client.follower import FIRST_STATE_TIMEOUT_S, ROBOT_SILENCE_TIMEOUT_S, SETTLED_S
 from acsard.client.ride import GRACE_S, OPEN_TIMEOUT_S
@@ -28,7 +25,6 @@ from acsard.host import clock
 from acsard.host.errors import NoAnswerError, NotDrivenError, UsageError
 from tests.each import each
 from tests.unit.screens import raw_sample, sample_of
-from tests.unit.test_client_course import Robot as StandingRobot
 
 US, OTHER = "joe/1/aa", "ann/2/bb"
 NEUTRAL = "send a zero first: app must send a zero"
@@ -318,7 +314,7 @@ def test_a_closed_connection_ends_the_drive(call: str) -> None:
         next(steps)
 
 
-def test_a_value_that_is_not_a_number_is_refused_before_a_command_is_sent() -> None:
+def test_a_wrong_number_is_refused_before_a_command_is_sent() -> None:
     value: Any
     for value in (float("nan"), float("inf"), "0.1", None, [0.1]):
         for place, name in enumerate(("linear", "angular", "seconds")):
@@ -328,6 +324,13 @@ def test_a_value_that_is_not_a_number_is_refused_before_a_command_is_sent() -> N
                 drive(*numbers)
     with pytest.raises(UsageError, match="linear: this number is too large"):
         drive(10**400, 0.0, 1.0)
+    for seconds in (0, -0.5):
+        words = f"seconds = {seconds:g}: a drive needs a time above 0"
+        with pytest.raises(UsageError, match=words):
+            drive(5.0, 0.0, seconds)
+    for speed in (0.0, -0.3):
+        with pytest.raises(UsageError, match=f"speed = {speed:g}: it must be above 0"):
+            move(-1.0, speed)
 
 
 # the zeros at the end of a drive that was interrupted
@@ -339,6 +342,14 @@ def zeros_of(world: World, idle_s: float | None = None) -> float:
     for pause in repeat_zeros(robot, None if idle_s is None else world.now - idle_s):
         world.now += pause
     return world.passed
+
+
+def test_zeros_are_repeated_until_the_state_shows_rest() -> None:
+    world = World(lambda t, last, sent: replace(FOLLOWED, linear=0.3 if t < 1.0 else 0.0))
+    assert 1.0 < zeros_of(world) < 1.5
+    assert set(world.sent) == {0.0}
+    assert len(world.sent) > 20
+    assert not world.subscribed
 
 
 @each(
@@ -357,110 +368,3 @@ def test_a_sender_that_was_idle_sends_no_zero_if_the_robot_follows_another_sourc
     zeros_of(world, 2 * GRACE_S)
     assert set(world.sent) == ({0.0} if is_sent else set())
     assert not world.subscribed
-
-
-# courses by the odometry
-
-
-class WithOdometry(World):
-    """A robot that publishes its odometry for some time, and does not move."""
-
-    def __init__(self, seconds: float) -> None:
-        super().__init__(followed)
-        self.body = StandingRobot(0.0)
-        self._odometry_s = seconds
-
-    def subscribe(self, name: str) -> Any:
-        if name == "state":
-            return super().subscribe(name)
-        queue: list[Any] = []
-
-        def receive() -> Any:
-            if not queue and self.passed < self._odometry_s:
-                queue.extend([sample_of(self.body.odom(), "acsard/acsar/odom"), None])
-            return queue.pop(0) if queue else None
-
-        return SimpleNamespace(try_recv=receive, undeclare=lambda: None)
-
-    def move(self) -> None:
-        robot: Any = self
-        for pause in move(1.0, 0.3)(Driver(robot)):
-            self.now += pause
-
-
-def test_a_move_without_odometry_ends_before_it_began() -> None:
-    world = WithOdometry(0.0)
-    with pytest.raises(NoAnswerError, match="no odometry arrives"):
-        world.move()
-    assert world.sent == []
-
-
-def test_a_move_stops_when_the_odometry_falls_silent() -> None:
-    world = WithOdometry(1.0)
-    with pytest.raises(NoAnswerError, match="no odometry arrives"):
-        world.move()
-    assert 0.3 in world.sent
-    # The error comes 2 s after the last message, and zeros from 0.2 s after it until rest.
-    assert next(n for n, speed in enumerate(reversed(world.sent)) if speed) >= 10
-
-
-def test_a_move_of_a_robot_that_does_not_move_ends_after_three_seconds() -> None:
-    world = WithOdometry(60.0)
-    with pytest.raises(NotDrivenError, match=r"no nearer for 3 s, and 1\.000 m is left"):
-        world.move()
-    assert 3.0 < world.passed < 4.0
-
-
-class Rolling(WithOdometry):
-    """A robot that follows each command at once."""
-
-    def __init__(self) -> None:
-        super().__init__(math.inf)
-        self.linear = self.angular = self.way = self.turned = 0.0
-
-    def send(self, linear: float, angular: float = 0.0) -> None:
-        super().send(linear, angular)
-        self.linear, self.angular = linear, angular
-
-    def follow(self, steps: Steps, is_set: float = math.inf) -> None:
-        """Drive a course, for at most 1000 s. After `is_set` s, the odometry is reset."""
-        robot: Any = self
-        body = self.body
-        for pause in steps(Driver(robot)):
-            self.now += pause
-            assert self.now < 1100.0
-            self.way += self.linear * pause
-            self.turned += self.angular * pause
-            body.x += self.linear * math.cos(body.yaw) * pause
-            body.y += self.linear * math.sin(body.yaw) * pause
-            body.yaw += self.angular * pause
-            if self.passed >= is_set:
-                body.x, body.y, body.yaw, is_set = 0.0, 0.0, 0.0, math.inf
-
-
-def test_a_long_way_at_a_low_speed_is_driven_to_its_end() -> None:
-    world = Rolling()
-    world.follow(move(20.0, 0.05))
-    assert world.way == pytest.approx(20.0, abs=0.01)
-    world = Rolling()
-    world.follow(turn(3600.0, 0.2))
-    assert world.turned == pytest.approx(20 * math.pi, abs=0.02)
-
-
-def test_a_course_ends_if_the_pose_is_set_on_the_way() -> None:
-    # From (3, -2) to (0, 0): the robot would drive 4.5 m in place of 1 m.
-    world = Rolling()
-    with pytest.raises(NotDrivenError, match="the pose was set"):
-        world.follow(move(1.0, 0.3), is_set=2.0)
-    assert world.way < 0.7
-    world = Rolling()
-    world.body.x, world.body.y, world.body.yaw = 0.0, 0.0, 2.0
-    with pytest.raises(NotDrivenError, match="the pose was set"):
-        world.follow(turn(90.0, 0.8), is_set=1.0)
-    assert world.turned < 1.0
-
-
-@each("speed", [0.0, -0.3])
-def test_a_move_needs_a_speed_above_zero(speed: float) -> None:
-    with pytest.raises(UsageError, match=f"speed = {speed:g}: it must be above 0"):
-        move(-1.0, speed)

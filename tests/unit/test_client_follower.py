@@ -6,6 +6,7 @@ from collections import deque
 from types import SimpleNamespace
 from typing import Any
 
+import pytest
 from msgspec.structs import replace
 
 from acsard.bus.subscription import MAX_QUEUED_SAMPLES
@@ -16,9 +17,10 @@ from acsard.client.follower import (
     ROBOT_SILENCE_TIMEOUT_S,
     Follower,
     Watch,
+    restarted,
 )
 from acsard.core.messages.schema import RobotState, Time
-from tests.unit.screens import STATE, raw_sample, sample_of
+from tests.unit.screens import BEFORE, STATE, raw_sample, sample_of
 
 TICK = 0.01
 
@@ -33,11 +35,23 @@ def query_times(follower: Follower, since: float, until: float) -> list[float]:
     return [now for now in times if follower.query_is_due(now)]
 
 
+def test_a_robot_is_queried_at_even_intervals_unless_it_publishes_often() -> None:
+    times = query_times(Follower(0.0), 0.0, 10.0)
+    even = [QUERY_PERIOD_S * n for n in range(1, len(times) + 1)]
+    assert times == pytest.approx(even, abs=10 * TICK)
+    assert len(times) > 25
+    follower = Follower(0.0)
+    for n in range(100):
+        assert not query_times(follower, n / 10, (n + 1) / 10)
+        follower.published(at(n), (n + 1) / 10)
+
+
 def test_a_robot_that_never_sent_a_state_is_reported_silent_after_a_longer_time() -> None:
     follower = Follower(0.0)
     assert not follower.silent(FIRST_STATE_TIMEOUT_S - TICK)
     assert follower.silent(FIRST_STATE_TIMEOUT_S + TICK)
     follower.published(STATE, 10.0)
+    assert (follower.state, follower.age(10.5)) == (STATE, 0.5)
     assert not follower.silent(10.0 + ROBOT_SILENCE_TIMEOUT_S - TICK)
     assert follower.silent(10.0 + ROBOT_SILENCE_TIMEOUT_S + TICK)
 
@@ -52,22 +66,31 @@ def test_a_robot_that_is_rarely_queried_is_not_silent_between_its_answers() -> N
         assert follower.answered(at(sec), now)
 
 
-def test_the_state_that_a_storage_repeats_is_no_sign_of_life() -> None:
+def test_a_changed_answer_is_a_sign_of_life_and_what_a_storage_repeats_is_none() -> None:
     follower = Follower(0.0)
-    follower.published(at(5), 1.0)
+    assert follower.query_is_due(1.0)
+    # The first answer may be stored, so a second query follows at once.
+    assert not follower.answered(at(5), 1.1)
+    assert (follower.state, follower.is_confirmed) == (at(5), False)
+    assert follower.query_is_due(1.1)
+    assert follower.answered(at(6), 1.2)
+    assert (follower.is_confirmed, follower.age(1.2)) == (True, 0.0)
     for n in range(10):
-        assert not follower.answered(at(5), 2.0 + n)
-        assert not follower.answered(at(4), 2.0 + n)
-    assert follower.age(12.0) == 11.0
-    assert follower.state == at(5)
+        assert not follower.answered(at(6), 2.0 + n)
+    assert follower.age(12.2) == 11.0
+    # A robot whose clock was set back has a new stamp in its second answer. A published state
+    # counts whatever its stamp is.
+    assert not follower.answered(at(3), 13.0)
+    assert follower.answered(at(4), 14.0)
+    follower.published(at(1), 15.0)
+    assert (follower.state, follower.age(15.0)) == (at(1), 0.0)
 
 
-def test_the_second_answer_of_a_robot_with_a_set_back_clock_is_a_sign_of_life() -> None:
-    follower = Follower(0.0)
-    follower.published(at(10**6), 1.0)
-    assert not follower.answered(at(3), 2.0)
-    assert follower.answered(at(4), 3.0)
-    assert follower.state == at(4)
+def test_decreasing_counters_show_a_restarted_daemon() -> None:
+    assert not restarted(None, STATE)
+    assert not restarted(BEFORE, STATE)
+    assert restarted(STATE, BEFORE)
+    assert restarted(STATE, replace(STATE, counters={}))
 
 
 class Robot:
@@ -97,21 +120,29 @@ class Robot:
 UNREADABLE = raw_sample(b"{}")
 
 
-def test_a_state_published_after_the_answer_replaces_the_answer() -> None:
+@pytest.mark.parametrize(("answer", "expected"), [(2, [3]), (3, [2, 3])])
+def test_published_states_and_answers_come_in_the_order_of_their_stamps(
+    answer: int, expected: list[int]
+) -> None:
     robot = Robot()
     watch = Watch(robot, 0.0)
     robot.queue.append(sample_of(at(1)))
-    watch.poll(0.0)
-    robot.answer = sample_of(at(2))
+    assert watch.poll(0.0) == [at(1)]
+    robot.answer = sample_of(at(answer))
     watch.poll(QUERY_PERIOD_S + 0.1)
-    robot.queue.append(sample_of(at(3)))
-    assert watch.poll(QUERY_PERIOD_S + 0.2) == [at(3)]
+    robot.queue.append(sample_of(at(5 - answer)))
+    assert watch.poll(QUERY_PERIOD_S + 0.2) == [at(n) for n in expected]
     assert watch.state == at(3)
+    watch.end()
+    assert not robot.followed
 
 
-def test_a_flood_of_messages_does_not_block_the_caller() -> None:
+def test_unreadable_messages_are_counted_until_a_readable_one_and_a_flood_blocks_nobody() -> None:
     robot = Robot()
     watch = Watch(robot, 0.0)
     robot.queue.extend([UNREADABLE] * (MAX_QUEUED_SAMPLES + 7))
+    assert watch.poll(0.0) == []
+    assert (watch.unreadable, len(robot.queue)) == (MAX_QUEUED_SAMPLES, 7)
+    robot.queue.append(sample_of(at(1)))
     watch.poll(0.0)
-    assert len(robot.queue) == 7
+    assert watch.unreadable == 0

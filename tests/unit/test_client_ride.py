@@ -6,7 +6,7 @@ from msgspec.structs import replace
 
 from acsard.client.follower import ROBOT_SILENCE_TIMEOUT_S, SETTLED_S, Follower
 from acsard.client.ride import (
-    MAX_SOURCE_TIMEOUT_S,
+    OPEN_TIMEOUT_S,
     OPENING_PERIOD_S,
     SEND_PERIOD_S,
     SLOWS_S,
@@ -98,6 +98,14 @@ def test_a_short_silence_of_a_robot_that_follows_does_not_interrupt_the_speed() 
     assert rider.wish(AHEAD, 0.5)[-1] == REST
 
 
+def test_a_robot_that_never_accepts_the_zeros_ends_the_ride() -> None:
+    rider = Rider(replace(RESTING, mode="ready", source="", reason="nav drives"))
+    rider.wish(AHEAD, OPEN_TIMEOUT_S - 0.1)
+    assert rider.ride.ended == ""
+    rider.wish(AHEAD, 0.2)
+    assert rider.ride.ended
+
+
 # the zeros at the end
 
 
@@ -108,11 +116,6 @@ def is_over_after(state: RobotState, seconds: float) -> bool:
     ride.moved(RELEASED)
     ride.state(state, RELEASED + seconds)
     return ride.is_over(RELEASED + seconds)
-
-
-def test_a_ride_without_a_speed_sends_no_zero() -> None:
-    assert Ride("app", OURS, Follower(RELEASED), RELEASED).is_over(RELEASED)
-    assert Rider().wish(None, 1.0) == []
 
 
 @each(
@@ -166,14 +169,5 @@ def test_zeros_go_on_while_the_robot_slows_down() -> None:
         rider.shows = replace(MOVING, linear=tenths / 100, angular=0.0)
         assert rider.wish(None, 0.1)
     rider.shows = RESTING
-    rider.wish(None, 0.2)
-    assert rider.wish(None, 5.0) == []
-
-
-def test_zeros_end_after_the_longest_timeout() -> None:
-    rider = Rider()
-    rider.wish(AHEAD, 1.0)
-    rider.shows = None
-    assert rider.wish(None, MAX_SOURCE_TIMEOUT_S - 0.1)[-1] == REST
     rider.wish(None, 0.2)
     assert rider.wish(None, 5.0) == []
