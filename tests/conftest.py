@@ -63,11 +63,11 @@ LIVE = ("bench", "firmware", "system", "systemd")
 VARIATIONS_PER_CI_TEST = 10
 """`.ci/run` runs about one in this many slow variations. The nightly job runs the others."""
 
-LONGEST = 400
+LONGEST = 100
 """Processor time of this process in which a test without one of these marks must end.
 
-Its unit is a loop of a million empty rounds, because computers differ: 10 ms where the longest of
-5,400 such tests takes 2.7 s.
+Its unit is a loop of a million empty rounds, because computers differ: 18 ms where the longest of
+3,300 such tests takes 1.0 s.
 """
 
 MARKS = {"slow", "soak", "bench", "network", "systemd", "firmware", "languages", "bridge"}
@@ -199,7 +199,7 @@ def pytest_runtest_call(item: pytest.Item) -> Generator[None, object, object]:
     result = yield
     took = time.process_time() - began
     usual = settings().max_examples <= 10 and "coverage" not in sys.modules
-    if took > 1.0 and usual and not MARKS & {mark.name for mark in item.iter_markers()}:
+    if took > 0.5 and usual and not MARKS & {mark.name for mark in item.iter_markers()}:
         began = time.process_time()
         for _ in range(1_000_000):
             pass

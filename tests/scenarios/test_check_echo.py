@@ -112,6 +112,7 @@ def test_an_ideal_board_whose_motors_lag_by_whole_periods_keeps_its_link(
     assert "line_echo" not in world.state.counters
 
 
+@pytest.mark.variations(4)
 @pytest.mark.parametrize("kind", [Echo, HalfDuplex])
 @pytest.mark.parametrize("acceleration", [1.0, 100.0])
 @pytest.mark.parametrize(("check", "counts"), [("off", 0), ("on", 0), ("on", 3200)])
@@ -133,6 +134,7 @@ def test_an_echo_that_begins_during_a_drive_ends_the_link_when_the_speed_changes
     assert moving([line for _, line in list(world.port.sent)[sent:]]) == []
 
 
+@pytest.mark.variations(3)
 @pytest.mark.parametrize("kind", [Echo, HalfDuplex])
 @pytest.mark.parametrize(("check", "counts"), [("off", 0), ("on", 0), ("on", 3200)])
 def test_an_echo_that_begins_during_a_steady_drive_ends_the_link(

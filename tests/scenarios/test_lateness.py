@@ -76,6 +76,7 @@ def rested(world: World, speaker: Speaker, queue_s: float, seconds: float) -> No
         world.run(0.05)
 
 
+@pytest.mark.variations(5)
 @pytest.mark.parametrize("way", STAMPED)
 def test_a_joystick_behind_a_queue_that_began_in_a_pause_moves_nothing(way: Way) -> None:
     """A former defect moved the robot by 10.9 m in 60 s while the stick rested."""
@@ -98,6 +99,7 @@ def test_of_a_queue_that_exists_before_the_first_command_none_with_an_echo_is_ob
     assert world.state.counters["command_round_trip"] > 300
 
 
+@pytest.mark.variations(4)
 @pytest.mark.parametrize("way", FOREIGN)
 def test_without_an_echo_a_constant_queue_from_the_first_command_on_cannot_be_seen(
     way: Way,
@@ -173,6 +175,7 @@ def test_a_zero_brakes_immediately_while_the_delay_of_its_sender_is_unproven(way
 # clocks that are set
 
 
+@pytest.mark.variations(3)
 @pytest.mark.parametrize(
     ("way", "end"),
     [*((way, "activate") for way in FOREIGN), ("signed", "new sender"), ("rmw", "new sender")],
@@ -218,8 +221,9 @@ STAMPS: dict[str, Callable[[float], float]] = {
 }
 
 
+@pytest.mark.variations(3)
 @each("kind", list(STAMPS))
-@each("way", ["rmw", "header", "signed"])
+@pytest.mark.parametrize("way", ["rmw", "header", "signed"])
 def test_stamps_that_are_no_times_are_named_and_never_drive_for_long(way: Way, kind: str) -> None:
     """Without a word about stamps, `state` asked for a zero for ever, or called the sender new."""
     world = quiet()

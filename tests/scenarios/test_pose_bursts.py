@@ -58,7 +58,7 @@ def test_with_the_mcu_s_counts_bursts_of_lost_lines_cost_at_most_a_centimetre() 
     assert off <= 0.01
 
 
-@pytest.mark.variations(12)
+@pytest.mark.variations(24)
 @pytest.mark.parametrize("check", ["off", "on"])
 @pytest.mark.parametrize("lag_s", [0.05, 0.15])
 @pytest.mark.parametrize("silence_s", [0.12, 0.15, 0.19, 0.3])

@@ -34,6 +34,7 @@ def sigmas(world: World) -> float:
     )
 
 
+@pytest.mark.variations(3)
 @pytest.mark.parametrize("wrong", [4.0, 0.25, 1.5])
 def test_with_wrong_counts_the_pose_uses_the_speeds_and_a_warning_says_so(wrong: float) -> None:
     robot = world(3200, "on", round(3200 * wrong))
@@ -61,6 +62,7 @@ def test_right_counts_are_used_from_the_first_second_of_driving() -> None:
     assert robot.state.pose_doubt == ""
 
 
+@pytest.mark.variations(4)
 @pytest.mark.parametrize("counts", [16, 96])
 @pytest.mark.parametrize("configured", [True, False])
 def test_a_coarse_encoder_on_a_plain_link_that_loses_replies_advises_the_checked_link(
@@ -94,6 +96,7 @@ def nothing(robot: World) -> None:
     pass
 
 
+@pytest.mark.variations(3)
 @pytest.mark.parametrize(
     ("counts", "link_check", "fault"),
     [

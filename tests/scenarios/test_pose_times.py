@@ -139,6 +139,7 @@ class Gap:
         return self.off - self.before, math.sqrt(grown)
 
 
+@pytest.mark.variations(6)
 @pytest.mark.parametrize("mute", [False, True], ids=["lost replies", "mute"])
 @pytest.mark.parametrize(("commanded", "waiting"), [(0.0, 0.0), (0.05, 0.0), (0.0, 0.2)])
 @pytest.mark.parametrize("stall", [0.2, 0.3, 0.5])
@@ -180,6 +181,7 @@ def test_a_stall_behind_the_command_to_rest_changes_nothing_in_the_pose() -> Non
     assert deviations[0] == pytest.approx(deviations[1], abs=0.002)
 
 
+@pytest.mark.variations(5)
 @pytest.mark.parametrize("speed", [0.3, 0.6, 0.9])
 @pytest.mark.parametrize("seconds", [0.2, 0.35, 0.4, 0.5, 0.8])
 def test_a_board_that_misses_the_command_to_rest_is_in_the_covariance(

@@ -14,7 +14,6 @@ from acsard.recording import recorder as module
 from acsard.recording.file import Head, Recording, listed
 from acsard.recording.recorder import Recorder
 from acsard.recording.replay import Playback
-from tests.each import each
 from tests.scenarios.world import World
 
 SECONDS = 200
@@ -86,7 +85,8 @@ def judge(path: Path, whole: list[int]) -> None:
     assert len(lost) <= len(whole) * (FRAME_S + 1.0) / SECONDS * 1.2
 
 
-@each("seed", range(4))
+@pytest.mark.variations(4)
+@pytest.mark.parametrize("seed", range(4))
 def test_damage_costs_one_frame(seed: int, long: Path, whole: list[int], tmp_path: Path) -> None:
     dice, data = random.Random(seed), bytearray(long.read_bytes())
     at, size = dice.randrange(len(data)), DAMAGED_BYTES[seed]

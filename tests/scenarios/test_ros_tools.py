@@ -394,7 +394,7 @@ class Nav2(Speaker):
             )
 
 
-@pytest.mark.variations(4)
+@pytest.mark.variations(12)
 @by_each_road
 @pytest.mark.parametrize("smoother", [True, False])
 @pytest.mark.parametrize("stamps", get_args(Stamps))

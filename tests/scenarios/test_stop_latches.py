@@ -105,14 +105,14 @@ def test_a_plain_clear_works_on_a_computer_that_stalls_all_the_time(
 ) -> None:
     """Without the law of the published age, none of 40 calls succeeded with stalls of 0.16 s."""
     done = 0
-    for _ in range(40):
+    for _ in range(8):
         call(world, "stop", "joe")
         for _ in range(2):
             world.run(1.5 - stall_s)
             world.stall(stall_s)
         world.run(0.05)
         done += call(world, "clear", "ann", via="rmw").success
-    assert done == 40
+    assert done == 8
 
 
 def test_every_stop_has_a_number_of_its_own_and_one_caller_has_one_stop(world: World) -> None:

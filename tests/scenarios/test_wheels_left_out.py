@@ -258,6 +258,7 @@ def test_a_wheel_that_is_ignored_as_dead_leaves_the_turn_rate_uncertain() -> Non
     assert made.odom.twist.covariance[35] > (truth / 3) ** 2
 
 
+@pytest.mark.variations(3)
 @pytest.mark.parametrize("kind", ["dead motor", "reversed motor", "both right encoders"])
 @pytest.mark.parametrize(("linear", "angular"), [(0.5, 0.0), (0.3, 1.0)])
 def test_a_wheel_that_may_be_right_although_it_is_ignored_is_in_the_covariance(
@@ -282,6 +283,7 @@ def test_a_wheel_that_may_be_right_although_it_is_ignored_is_in_the_covariance(
     assert 0.1 < error < 3.0 * std
 
 
+@pytest.mark.variations(6)
 @pytest.mark.parametrize("configured", [False, True])
 @pytest.mark.parametrize("counts", [16, 40, 100])
 @pytest.mark.parametrize(("linear", "angular"), [(0.5, 0.0), (0.15, 0.0), (0.0, 1.5)])

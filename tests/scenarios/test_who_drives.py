@@ -62,6 +62,7 @@ def test_the_zeros_of_one_program_never_arm_another(way: Way) -> None:
         assert not moved(world, start_ns), seed
 
 
+@pytest.mark.variations(8)
 @pytest.mark.parametrize("way", get_args(Way))
 def test_a_pause_arms_no_sender(way: Way) -> None:
     """A sender that pauses after a `clear` and sends speeds again does not move the robot.
@@ -100,7 +101,8 @@ def test_a_zero_of_a_shared_identity_arms_when_no_speed_has_followed_for_a_secon
         assert world.state.mode == mode
 
 
-@each("way", get_args(Way))
+@pytest.mark.variations(8)
+@pytest.mark.parametrize("way", get_args(Way))
 def test_a_sender_that_was_silent_for_ten_seconds_must_send_a_zero_again(way: Way) -> None:
     """The first speed after an hour of silence moved the robot by 1.16 m in 3 s."""
     world = quiet()
@@ -117,7 +119,8 @@ def test_a_sender_that_was_silent_for_ten_seconds_must_send_a_zero_again(way: Wa
     assert world.state.mode == "driving"
 
 
-@each("way", get_args(Way))
+@pytest.mark.variations(8)
+@pytest.mark.parametrize("way", get_args(Way))
 def test_a_zero_that_was_too_early_to_be_proven_arms_nothing_behind_ten_seconds_of_silence(
     way: Way,
 ) -> None:
@@ -158,7 +161,8 @@ def navigating(way: Way, name: str = "nav2") -> tuple[World, Speaker]:
     return world, speaker
 
 
-@each("way", get_args(Way))
+@pytest.mark.variations(8)
+@pytest.mark.parametrize("way", get_args(Way))
 def test_where_a_pause_arms_every_goal_drives_without_a_zero(way: Way) -> None:
     world, nav = navigating(way)
     for pause in (1.1, 12.0, 0.0):
@@ -168,7 +172,8 @@ def test_where_a_pause_arms_every_goal_drives_without_a_zero(way: Way) -> None:
         world.run(pause)
 
 
-@each("event", ["clear", "deactivate", "link", "reset", "restart", "stall"])
+@pytest.mark.variations(3)
+@pytest.mark.parametrize("event", ["clear", "deactivate", "link", "reset", "restart", "stall"])
 def test_where_a_pause_arms_a_goal_under_way_does_not_drive_after_an_event(event: str) -> None:
     world, nav = navigating("rmw")
     if event == "restart":
@@ -241,6 +246,7 @@ def arrive(dice: random.Random) -> None:
             world.run(1.0)
 
 
+@pytest.mark.variations(4)
 @pytest.mark.parametrize("seed", range(12))
 def test_of_two_senders_none_moves_unarmed_and_each_armed_one_moves(seed: int) -> None:
     arrive(random.Random(seed))

@@ -49,8 +49,8 @@ def test_the_cause_is_named(kind: str) -> None:
     ("place", "words"),
     [
         (TRIP.place.conj(), "y must point to the left"),
-        (TRIP.place * 1000.0, "are x and y in m"),
-        (TRIP.place[::-1], "x, y does not follow the wheels"),
+        pytest.param(TRIP.place * 1000.0, "are x and y in m", marks=pytest.mark.slow),
+        pytest.param(TRIP.place[::-1], "x, y does not follow the wheels", marks=pytest.mark.slow),
     ],
 )
 def test_the_cause_of_positions_is_named(place: Any, words: str) -> None:
@@ -59,6 +59,7 @@ def test_the_cause_of_positions_is_named(place: Any, words: str) -> None:
     assert words in str(refused.value)
 
 
+@pytest.mark.slow
 def test_a_sound_log_has_no_note_of_its_own() -> None:
     assert result(TRIP, places=True).notes == ("a note",)
 

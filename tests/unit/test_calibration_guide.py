@@ -73,6 +73,7 @@ class Robot(Prompt):
         return float(np.round(answer, 3 if ask.unit == "m" else 0))
 
 
+@pytest.mark.variations(3)
 @pytest.mark.parametrize("track", [1.0, 1.6, 2.4])
 @pytest.mark.parametrize("method", ["gyro", "tape"])
 def test_a_guided_drive_finds_track_and_size_and_stays_on_the_floor(

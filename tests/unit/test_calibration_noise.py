@@ -275,6 +275,7 @@ def test_the_noise_of_a_calibration_describes_other_drives_of_two_robots() -> No
 LOG = runs(SETS["differential"].log(np.random.default_rng(1), 1.003))
 
 
+@pytest.mark.slow
 def test_the_noise_of_a_good_robot_is_found_and_then_stays() -> None:
     found = fit(LOG, Config())
     shown = noise(LOG, found, OdometryConfig())

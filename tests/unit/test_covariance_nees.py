@@ -56,7 +56,7 @@ def drive_of(scenario: str, model: str, runs: int) -> Array:
     )
 
 
-@pytest.mark.parametrize("scenario", ["random", "straight"])
+@pytest.mark.parametrize("scenario", [pytest.param("random", marks=pytest.mark.slow), "straight"])
 def test_the_covariance_of_a_sample_of_robots_matches_their_pose_errors(scenario: str) -> None:
     """`-m soak` has 2,000 robots for each drive and model."""
     check(drive_of(scenario, "wheels, parameters", 500), scenario, 0.88)
