@@ -165,11 +165,11 @@ class Rolling(WithOdometry):
 
 def test_a_long_way_at_a_low_speed_is_driven_to_its_end() -> None:
     world = Rolling()
-    world.follow(move(20.0, 0.05))
-    assert world.way == pytest.approx(20.0, abs=0.01)
+    world.follow(move(6.0, 0.05))
+    assert world.way == pytest.approx(6.0, abs=0.01)
     world = Rolling()
-    world.follow(turn(3600.0, 0.2))
-    assert world.turned == pytest.approx(20 * math.pi, abs=0.02)
+    world.follow(turn(720.0, 0.2))
+    assert world.turned == pytest.approx(4 * math.pi, abs=0.02)
 
 
 def test_a_course_ends_if_the_pose_is_set_on_the_way() -> None:
