@@ -1,29 +1,26 @@
-"""Print the processor time of the robot's page, and the delay of a command through the page."""
+"""Print the processor time of the robot's page, and the delay of a finger on it."""
 
 from __future__ import annotations
 
-import asyncio
 import json
 import re
 import statistics
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
-from acsard.client import connect
 from acsard.web.answers import PAGE_DIRECTORY
 from tests.bench.rig import ACSARD
 from tests.bench.rigs import config, driven, waits_us
-from tests.system.browser import Hands, Page, hands, run
+from tests.system.browser import Page
 from tests.system.chromium import CHROMIUM, PHONE, Browser, browsing
 from tests.system.harness import (
     Bus,
     Daemon,
     FarPeer,
-    Peer,
     Periods,
     Program,
     cpu_seconds,
@@ -73,16 +70,6 @@ SECONDS, RATE_HZ = 10.0, 100.0
 
 TIMEOUT_MS = 250.0
 """Timeout of source teleop, ms."""
-
-
-COMMANDS = 300
-
-
-@pytest.fixture
-def peer(tmp_path: Path) -> Iterator[Peer]:
-    """Run a simulated board in another process."""
-    with Peer(tmp_path / "mcu") as peer:
-        yield peer
 
 
 def subscribed() -> list[tuple[str, int]]:
@@ -144,56 +131,12 @@ def test_twenty_viewers_cost_the_page_and_not_the_robot(tmp_path: Path) -> None:
     assert min(missed for missed, _ in watched_by_all) <= most
 
 
-def lines_with(peer: Peer, speed: float, after: float) -> float | None:
-    """Return when the board received the first line with this speed after `after`, or None."""
-    want = f"ap{speed:05.2f},".encode()
-    return next((h.at for h in peer.lines[-50:] if h.at >= after and h.line.startswith(want)), None)
-
-
-async def measured(peer: Peer, send: Callable[[float], object]) -> list[float]:
-    """Send commands at 20 Hz. Return the time in ms from each one to its line at the board."""
-    delays_ms = []
-    for n in range(COMMANDS):
-        linear = 0.2 if n % 2 else 0.25
-        sent = time.monotonic()
-        result = send(linear)
-        if asyncio.iscoroutine(result):
-            await result
-        await asyncio.sleep(0.05)
-        at = lines_with(peer, linear / 0.05, sent)
-        if at is not None:
-            delays_ms.append(1000 * (at - sent))
-    return delays_ms
-
-
 def print_spread(what: str, times: list[float]) -> float:
     """Print the spread, and return the median."""
     times.sort()
     p50, p99 = statistics.median(times), times[int(len(times) * 0.99)]
     print(f"\n{what}: {len(times)} commands, p50 {p50:.2f} ms, p99 {p99:.2f} ms")
     return p50
-
-
-def test_a_command_by_the_page_is_soon_on_the_port(tmp_path: Path, peer: Peer) -> None:
-    fast = {"linear_acceleration": 100.0, "linear_deceleration": 100.0}
-    fast["linear_stop_deceleration"] = 100.0
-    with Daemon(tmp_path, peer.path, {"limits": fast}) as daemon, Page(daemon, tmp_path) as page:
-        medians = {}
-
-        async def by_page() -> None:
-            async with hands(page) as ours:
-                reading = asyncio.create_task(_read(ours))
-                await ours.hold(0.0, 0.8)
-                medians["page"] = print_spread("page", await measured(peer, ours.drive))
-                reading.cancel()
-
-        run(by_page, 120.0)
-        with connect(daemon.endpoint, source="teleop") as robot:
-            for _ in range(80):
-                robot.send(0.0)
-                time.sleep(0.02)
-            medians["client"] = print_spread("client", asyncio.run(measured(peer, robot.send)))
-    assert medians["page"] < 10 * max(medians["client"], 0.5)
 
 
 FINGERS, LIFTS = 150, 40
@@ -276,8 +219,3 @@ def test_a_finger_on_the_stick_is_soon_on_the_port(tmp_path: Path) -> None:
         f"{moves / put:.0f}, one lifted {lifts / put:.0f} times that at p50"
     )
     assert lifts < TIMEOUT_MS / 4, "it is said, and no timeout is waited for"
-
-
-async def _read(ours: Hands) -> None:
-    while True:
-        json.loads((await ours.socket.receive()).data)

@@ -7,6 +7,7 @@ import re
 
 import pytest
 
+from tests.each import each
 from tests.simulate import planted
 from tests.simulate.planted import CASE_MINUTES, FAULT_MINUTES, TABLE, edited, read, text_of
 from tests.simulate.planted_faults import CASES, FAULTS, PLANS_OF_FAULT, Fault
@@ -17,7 +18,7 @@ RAISES = {"commands raise"}
 """Faults that raise an exception. Each seed finds a fault that does so by a mistake in its text."""
 
 
-@pytest.mark.parametrize("fault", ALL, ids=lambda fault: fault.name)
+@each("fault", ALL)
 def test_a_fault_fits_the_product_and_is_still_a_program(fault: Fault) -> None:
     for text in edited(fault).values():
         ast.parse(text)

@@ -52,22 +52,6 @@ def test_the_link_is_never_missing_while_it_changes(
     assert versions.current(tmp_path) == "0.3.0"
 
 
-@pytest.mark.parametrize(
-    ("names", "newest"),
-    [
-        (("0.2.0", "0.10.0"), "0.10.0"),
-        (("0.10.0", "0.2.0"), "0.10.0"),
-        (("0.2.0", "0.2.0.dev0+gb"), "0.2.0"),
-        (("0.2.0.dev0+gb", "0.2.0.dev0+ga"), "0.2.0.dev0+ga"),
-    ],
-)
-def test_versions_are_sorted_by_number_and_then_by_age(
-    tmp_path: Path, names: tuple[str, ...], newest: str
-) -> None:
-    versions_in(tmp_path, *names)
-    assert versions.installed(tmp_path)[-1] == newest
-
-
 def test_a_newer_version_that_is_not_in_use_is_found(tmp_path: Path) -> None:
     versions_in(tmp_path, "0.2.0", "0.3.0", ".unfinished-x", "dist", "venv")
     assert versions.unused(tmp_path) == "", "there is no service"
@@ -160,16 +144,6 @@ def test_a_copy_with_other_content_gets_a_name_of_its_own(
     assert versions.is_own(first)
     assert versions.is_own(second)
     assert sorted(os.listdir(tmp_path)) == sorted((first, second))
-
-
-def test_files_of_one_size_and_date_are_compared_by_their_content(tmp_path: Path) -> None:
-    # All files of a package have one date, and each commit has one length.
-    for name, commit in (("one", "a1b2"), ("other", "c3d4")):
-        (tmp_path / name).mkdir()
-        (tmp_path / name / "commit").write_text(commit)
-        os.utime(tmp_path / name / "commit", (0, 0))
-    assert not versions.same(tmp_path / "one", tmp_path / "other")
-    assert versions.same(tmp_path / "one", tmp_path / "one")
 
 
 def seen(
