@@ -1,7 +1,7 @@
 """Random drives, the lines that an MCU makes from them, and the times at which a host reads them.
 
 The tests compare the pose of the session under test with that of the encoders' counts. The seed
-determines all random numbers.
+determines all random numbers. Times are in s.
 """
 
 from __future__ import annotations
@@ -23,81 +23,63 @@ from acsard.core.link.session import McuSession
 from acsard.core.values import NS_PER_S, Instant, Pose, Received, WheelSpeeds
 from tests.unit.odometer import Odometer, arc
 
-RATE = 100.0
-PERIOD, DRIFT = 0.01, 2e-4
-"""Report period, s, and largest relative drift of an MCU's clock."""
-
-LEAST_WINDOW = 0.004
-"""Time, s, in which the firmware counts before it computes new speeds."""
-
-BYTE = 10 / 115200
-"""Time of one byte on the wire, s."""
-
-LATENCY, SCHEDULER = 0.016, 0.0003
-"""Time for which an FTDI adapter holds bytes back, and mean wait of a process for its core, s."""
-
-PIECE = 1024
-"""Bytes that one read takes."""
-
+RATE, PERIOD = 100.0, 0.01
+DRIFT = 2e-4  # largest relative drift of an MCU's clock
+LEAST_WINDOW = 0.004  # in which the firmware counts before it computes new speeds
+BYTE = 10 / 115200  # time of one byte on the wire
+LATENCY = 0.016  # for which an FTDI adapter holds bytes back
+SCHEDULER = 0.0003  # mean wait of a process for its core
+PIECE = 1024  # bytes that one read takes
 ROLLING = WheelSpeeds(1.0, 1.0, 1.0, 1.0)
-
-GRID = 0.001
-"""Time between the points of a path, s."""
-
-RIPPLE = 0.03
-"""Variation of each side's speed from report to report, rad/s."""
-
-AT_REST = 1500
-"""Points of a path before which nothing moves, because a robot stands while its link starts.
-
-The robot also stands at the end, so that lines still on their way do not matter.
-"""
-
+GRID = 0.001  # time between the points of a path
+RIPPLE = 0.03  # variation of each side's speed from report to report, rad/s
+# The robot stands while its link starts, and at the end, so that lines still on their way do not
+# matter.
+AT_REST_S = 1.5
 WALL_NS = 1_800_000_000 * NS_PER_S
 
 Adapter = Literal["acm", "ftdi"]
 
 
-class Path:
-    """Wheel angles of both sides over time in a drive with turns and stops."""
+class Case(Struct, frozen=True):
+    """Properties of the connection between MCU and host. Shares are from 0 to 1.
 
-    def __init__(self, rng: np.random.Generator, seconds: float) -> None:
-        count = int((seconds + 2.0) / GRID)
-        linear = _ramped(rng, count, 1.0, 1.0, lowest=0.6)
-        angular = _ramped(rng, count, 1.0, 4.0)
-        left = (linear - angular * 0.15) / 0.05
-        right = (linear + angular * 0.15) / 0.05
-        # No wheel turns so evenly that two decimals always round it the same way.
-        left += np.repeat(rng.normal(0, RIPPLE, count // 10 + 1), 10)[:count]
-        right += np.repeat(rng.normal(0, RIPPLE, count // 10 + 1), 10)[:count]
-        for wheels in (left, right):
-            wheels[:AT_REST] = wheels[int((seconds - 1.0) / GRID) :] = 0.0
-        self.left = np.concatenate([[0.0], np.cumsum(left) * GRID])
-        self.right = np.concatenate([[0.0], np.cumsum(right) * GRID])
-
-    def angles(self, at: float) -> tuple[float, float]:
-        """Return the angles of the left and right wheels at time `at` in s, rad."""
-        place = at / GRID
-        i = int(place)
-        share = place - i
-        left, right = self.left, self.right
-        return (
-            float(left[i] + (left[i + 1] - left[i]) * share),
-            float(right[i] + (right[i + 1] - right[i]) * share),
-        )
-
-
-def _ramped(
-    rng: np.random.Generator, count: int, most: float, rate: float, lowest: float | None = None
-) -> np.ndarray:
-    """Return a speed that changes at `rate` towards random targets.
-
-    A sixth of the targets are zero.
+    A prompted MCU answers the host's lines, at times that differ by `thinking`. Each answer covers
+    the time since the last one. Otherwise the MCU reports by its own clock. `counts` are those of a
+    turn; 0 means that the encoders have no steps. On a `checked` link, commands and replies have a
+    number and a checksum, and replies have the counts, too.
     """
-    lowest = -most if lowest is None else lowest
+
+    adapter: Adapter = "acm"
+    prompted: bool = False
+    thinking: float = 0.0002
+    stall: float = 0.0
+    stall_every: float = 5.0
+    lost: float = 0.0
+    counts: int = 0
+    checked: bool = False
+
+
+def _path(rng: np.random.Generator, seconds: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return the wheel angles of the left and right side in a drive with turns and stops."""
+    count = int((seconds + 2.0) / GRID)
+    linear = _ramped(rng, count, 0.6, 1.0)
+    angular = _ramped(rng, count, -1.0, 4.0)
+    sides = []
+    for side in (-1, 1):
+        # No wheel turns so evenly that two decimals always round it the same way.
+        ripple = np.repeat(rng.normal(0, RIPPLE, count // 10 + 1), 10)[:count]
+        speeds = (linear + side * angular * 0.15) / 0.05 + ripple
+        speeds[: int(AT_REST_S / GRID)] = speeds[int((seconds - 1.0) / GRID) :] = 0.0
+        sides.append(np.concatenate([[0.0], np.cumsum(speeds) * GRID]))
+    return sides[0], sides[1]
+
+
+def _ramped(rng: np.random.Generator, count: int, lowest: float, rate: float) -> np.ndarray:
+    """Return a speed that changes at `rate` towards targets up to 1, of which a sixth are zero."""
     targets = np.empty(0)
     while len(targets) < count:
-        target = 0.0 if rng.random() < 1 / 6 else rng.uniform(lowest, most)
+        target = 0.0 if rng.random() < 1 / 6 else rng.uniform(lowest, 1.0)
         targets = np.concatenate([targets, np.full(int(rng.uniform(0.8, 4.0) / GRID), target)])
     speeds, speed = np.empty(count), 0.0
     for i, target in enumerate(targets[:count].tolist()):
@@ -106,91 +88,68 @@ def _ramped(
     return speeds
 
 
-class Case(Struct, frozen=True):
-    """Properties of the connection between MCU and host. Times are in s, shares are from 0 to 1."""
-
-    adapter: Adapter = "acm"
-    prompted: bool = False
-    """Whether the MCU answers the host's lines.
-
-    Each answer covers the time since the last one. Otherwise the MCU reports by its own clock.
-    """
-    thinking: float = 0.0002
-    """Largest difference between the times of two answers, s."""
-    stall: float = 0.0
-    stall_every: float = 5.0
-    lost: float = 0.0
-    burst_every: float = 0.0
-    """Mean time between bursts of 0.1 to 0.5 s of lost lines, s; 0 means that there are none."""
-    counts: int = 0
-    """Counts per turn of the encoders; 0 means that they have no steps."""
-    checked: bool = False
-    """Whether commands and replies have a number and a checksum, and replies the counts, too."""
-
-
-class Line(Struct):
-    """One report of mean speeds from `before` to `at`. The MCU makes it at `at`. Times are in s."""
-
-    at: float
-    before: float
-    speeds: WheelSpeeds
-    data: bytes
-
-
 class Host:
-    """The session under test, its pose, and the pose from the encoders' counts."""
+    """The session under test, its pose, and the pose from the encoders' counts.
+
+    `made` has the time of each line's sample, `heard` the feedback of the session.
+    """
 
     def __init__(self, case: Case, seed: int, seconds: float) -> None:
         self.case, self.seconds = case, seconds
         self.rng = rng = np.random.default_rng(seed)
-        self.path = Path(rng, seconds)
+        self.left, self.right = _path(rng, seconds)
         mcu = McuConfig(
             reply_period=0.0 if case.prompted else PERIOD,
             encoder_counts=case.counts,
             link_check="on" if case.checked else "off",
         )
         self.setup, self.session = LinkSetup.of(mcu, RATE), McuSession()
-        self.found = Odometer(counts=case.counts)
-        self.counter = Arcs()  # the pose from the encoders' counts; `found` is the session's
-        self.lines: list[Line] = []
+        self.found, self.counted = Odometer(counts=case.counts), Pose()
+        self.made: list[float] = []
         self.heard: list[Feedback] = []
-        self.now = 0.0
-        """Time of the last step, s."""
-        self._reported = 0.0
-        self._wheels = self._turned(0.0)
-        self._stalls = _times(rng, seconds, case.stall_every, case.stall) if case.stall else []
-        self._starts = [start for start, _ in self._stalls]
-        every = case.burst_every
-        starts = [start for start, _ in _times(rng, seconds, every, 0.0)] if every else []
-        self._bursts = [(start, start + rng.uniform(0.1, 0.5)) for start in starts]
+        self.now = self._reported = 0.0  # times of the last step, and of the last new speeds
+        self._wheels, self._speeds = self._turned(0.0), WheelSpeeds()
+        starts = np.arange(case.stall_every * 0.7, seconds - 1.0, case.stall_every)
+        starts += rng.uniform(0, case.stall_every * 0.1, len(starts))
+        self._stalls: list[float] = starts.tolist() if case.stall else []
         self._phase = rng.uniform(0, LATENCY)
 
     # the microcontroller
 
-    def report(self, at: float, nominal: float | None, command: bytes = b"") -> Line:
-        """Make the MCU's next line at time `at`, s, with the mean speeds since its last line.
+    def report(self, at: float, nominal: float | None, command: bytes = b"") -> bytes:
+        """Return the MCU's next line, with the mean speeds since its last line.
 
         If that was less than `LEAST_WINDOW` ago, the line repeats its speeds.
         """
-        if at - self._reported < LEAST_WINDOW and self.lines:
-            speeds = self.lines[-1].speeds
-            data = self._encoded(speeds, self._reported, self._wheels, command)
-            self.lines.append(Line(at, self._reported, speeds, data))
-            return self.lines[-1]
-        then, now = self._wheels, self._turned(at)
-        self._wheels = now
-        dt = at - self._reported if nominal is None else nominal
-        a, b, c, d = (after - before for after, before in zip(now, then, strict=True))
-        speeds = WheelSpeeds(*(round(angle / dt, 2) for angle in (a, b, c, d)))
-        line = Line(at, self._reported, speeds, self._encoded(speeds, at, now, command))
-        self._reported = at
-        self.lines.append(line)
-        self.counter.roll((b + c) / 2, (a + d) / 2)
-        return line
+        self.made.append(at)
+        if at - self._reported >= LEAST_WINDOW:
+            then, now = self._wheels, self._turned(at)
+            dt = at - self._reported if nominal is None else nominal
+            a, b, c, d = (after - before for after, before in zip(now, then, strict=True))
+            self._wheels, self._reported = now, at
+            self._speeds = WheelSpeeds(*(round(angle / dt, 2) for angle in (a, b, c, d)))
+            left, right = (b + c) / 2 * 0.05, (a + d) / 2 * 0.05
+            self.counted = arc(self.counted, (right + left) / 2, (right - left) / 0.30)
+        data = ", ".join(
+            f"{letter}{'n' if speed < 0 else 'p'}{abs(speed):05.2f}"
+            for letter, speed in zip("abcd", self._speeds.as_tuple(), strict=True)
+        ).encode()
+        if b"#" in command:
+            data += b"#" + command[command.index(b"#") + 1 :][:2]
+            if counts := self.case.counts:
+                turns = [round(angle * counts / math.tau) for angle in self._wheels]
+                fields = [int(self._reported * 1000), *turns]
+                data += b"@" + b"".join(b"%04X" % (field % 65536) for field in fields)
+            data += b"*%04X" % binascii.crc_hqx(data, 0)
+        return data + b"\r\n"
 
     def _turned(self, at: float) -> tuple[float, ...]:
         """Return the angles of the wheels a to d by their encoders, rad."""
-        left, right = self.path.angles(at)
+        i = int(at / GRID)
+        share = at / GRID - i
+        left, right = (
+            float(side[i] + (side[i + 1] - side[i]) * share) for side in (self.left, self.right)
+        )
         wheels = right, left, left, right
         if not self.case.counts:
             return wheels
@@ -199,32 +158,13 @@ class Host:
         edges = zip(wheels, (0.0, 0.6, 0.1, 0.4), strict=True)
         return tuple(math.floor(angle / step + edge) * step for angle, edge in edges)
 
-    def _encoded(
-        self, speeds: WheelSpeeds, at: float, wheels: tuple[float, ...], command: bytes
-    ) -> bytes:
-        data = _encode(speeds)
-        if b"#" not in command:
-            return data
-        number, counts = int(command[command.index(b"#") + 1 :][:2], 16), self.case.counts
-        line = b"%b#%02X" % (data.strip(), number)
-        if counts:
-            fields = [
-                int(at * 1000),
-                *(round(angle * counts / math.tau) for angle in wheels),
-            ]
-            line += b"@" + b"".join(b"%04X" % (field % 65536) for field in fields)
-        return b"%b*%04X\r\n" % (line, binascii.crc_hqx(line, 0))
-
     # the path to the host
 
-    def lost(self, line: Line) -> bool:
-        """Return whether the connection loses this line completely."""
-        in_burst = any(begin <= line.at < end for begin, end in self._bursts)
-        return in_burst or self.rng.random() < self.case.lost
-
-    def delivered(self, line: Line) -> float:
-        """Return the time at which the kernel has the line's bytes."""
-        at = line.at + len(line.data) * BYTE
+    def delivered(self, at: float, data: bytes) -> float | None:
+        """Return when the kernel has the bytes of a line, or None if the connection loses it."""
+        if self.rng.random() < self.case.lost:
+            return None
+        at += len(data) * BYTE
         if self.case.adapter == "ftdi":
             return float(np.ceil((at - self._phase) / LATENCY) * LATENCY + self._phase)
         return at + self.rng.uniform(0, 0.001)
@@ -234,13 +174,13 @@ class Host:
     def awake(self, at: float) -> float:
         """Return the time at which a process that is due at `at` really runs."""
         at += self.rng.exponential(SCHEDULER)
-        i = bisect.bisect_right(self._starts, at) - 1
-        if i >= 0 and at < self._stalls[i][1]:
-            at = self._stalls[i][1] + self.rng.exponential(SCHEDULER)
+        i = bisect.bisect_right(self._stalls, at) - 1
+        if i >= 0 and at < self._stalls[i] + self.case.stall:
+            at = self._stalls[i] + self.case.stall + self.rng.exponential(SCHEDULER)
         return at
 
     def ticks(self) -> Iterator[float]:
-        """Yield the times of the control steps, s. A step that a stall prevents has no time."""
+        """Yield the times of the control steps. A step that a stall prevents has no time."""
         at = 0.0
         while True:
             at = max(self.awake((int(at * RATE + 1e-6) + 1) / RATE), at + 1e-6)
@@ -255,11 +195,18 @@ class Host:
         self.session.sent(self.setup, now.mono_ns, was_written=True)
         return line
 
-    def read(self, at: float, data: bytes) -> None:
-        """Let the host read these bytes piece by piece, as an adapter delivers them."""
-        for start in range(0, len(data), PIECE):
-            now = _instant(at + start / PIECE * 0.0002)
-            self._update(now, (Received(now, data[start : start + PIECE]),))
+    def read(self, arrivals: deque[tuple[float, bytes]], tick: float) -> None:
+        """Read, piece by piece, everything that the host can read before its next step."""
+        while arrivals and arrivals[0][0] < tick:
+            at = max(self.awake(arrivals[0][0]), self.now)
+            if at >= tick:
+                return
+            data = b""
+            while arrivals and arrivals[0][0] <= at:
+                data += arrivals.popleft()[1]
+            for start in range(0, len(data), PIECE):
+                now = _instant(at + start / PIECE * 0.0002)
+                self._update(now, (Received(now, data[start : start + PIECE]),))
 
     def _update(self, now: Instant, received: tuple[Received, ...]) -> None:
         for feedback in self.session.update(self.setup, now, True, 1, received):
@@ -267,102 +214,54 @@ class Host:
             self.found.fold(feedback)
 
 
-class Arcs:
-    """The pose of a robot of default size, computed from the angles that its sides roll, rad."""
-
-    def __init__(self) -> None:
-        self.pose = Pose()
-
-    def roll(self, left: float, right: float) -> None:
-        self.pose = arc(self.pose, (right + left) / 2 * 0.05, (right - left) * 0.05 / 0.30)
-
-
 def _instant(at: float) -> Instant:
     ns = 10**12 + int(at * NS_PER_S)
     return Instant(ns, ns + WALL_NS)
 
 
-def _times(
-    rng: np.random.Generator, seconds: float, every: float, length: float
-) -> list[tuple[float, float]]:
-    """Return random start and end times, s, of a disturbance that recurs about every `every` s."""
-    starts = np.arange(every * 0.7, seconds - 1.0, every) + rng.uniform(0, every * 0.2)
-    starts += rng.uniform(0, every * 0.1, len(starts))
-    return [(start, start + length) for start in starts.tolist()]
-
-
-def _encode(speeds: WheelSpeeds) -> bytes:
-    tokens = [
-        f"{letter}{'n' if speed < 0 else 'p'}{abs(speed):05.2f}"
-        for letter, speed in zip("abcd", speeds.as_tuple(), strict=True)
-    ]
-    return ", ".join(tokens).encode() + b"\r\n"
-
-
 def drive(case: Case, seed: int, seconds: float) -> Host:
     """Simulate a whole drive and return its host."""
     host = Host(case, seed, seconds)
-    if case.prompted:
-        _prompted(host)
-    else:
-        reporting(host)
+    (_prompted if case.prompted else _reporting)(host)
     return host
 
 
-def reporting(host: Host) -> None:
-    """Simulate a free-running MCU, which makes a line in every period of its own clock.
+def _reporting(host: Host) -> None:
+    """Simulate an MCU that makes a line in every period of its own clock.
 
     The MCU divides the counts by the nominal period.
     """
     arrivals: deque[tuple[float, bytes]] = deque()
     period = PERIOD * (1 + host.rng.uniform(-DRIFT, DRIFT))
     for k in range(1, int(host.seconds / period)):
-        line = host.report(k * period, PERIOD)
-        if not host.lost(line):
-            arrivals.append((host.delivered(line), line.data))
+        data = host.report(k * period, PERIOD)
+        if (came := host.delivered(k * period, data)) is not None:
+            arrivals.append((came, data))
     for tick in host.ticks():
-        _read_until(host, arrivals, tick)
+        host.read(arrivals, tick)
         if not arrivals:
             return
         host.tick(tick)
 
 
 def _prompted(host: Host) -> None:
-    """Simulate a prompted MCU, which answers each line after 1 ms or more.
+    """Simulate an MCU that answers each line after 1 ms or more.
 
     The MCU divides the counts by the true time since its last line.
     """
     arrivals: deque[tuple[float, bytes]] = deque()
     free = last = 0.0
     for tick in host.ticks():
-        _read_until(host, arrivals, tick)
+        host.read(arrivals, tick)
         if tick > host.seconds:
             return
         command = host.tick(tick)
         if command is None or command.startswith(b"?"):
             continue
-        made = max(
-            tick + 0.0001 + 33 * BYTE + 0.001 + host.rng.uniform(0, host.case.thinking), free
-        )
-        line = host.report(made, None, command)
-        free = made + len(line.data) * BYTE
-        if not host.lost(line):
-            last = max(host.delivered(line), last)
-            arrivals.append((last, line.data))
-
-
-def _read_until(host: Host, arrivals: deque[tuple[float, bytes]], tick: float) -> None:
-    """Read everything that the host can read before its next step."""
-    while arrivals and arrivals[0][0] < tick:
-        at = max(host.awake(arrivals[0][0]), host.now)
-        if at >= tick:
-            return
-        data = b""
-        while arrivals and arrivals[0][0] <= at:
-            data += arrivals.popleft()[1]
-        host.read(at, data)
-
-
-def print_row(name: str, goal: str, result: str) -> None:
-    """Print one row of a table of results."""
-    print(f"\n{name:46} goal {goal:38} found {result}", end="")
+        thinking = 0.0011 + host.rng.uniform(0, host.case.thinking)
+        made = max(tick + 33 * BYTE + thinking, free)
+        data = host.report(made, None, command)
+        free = made + len(data) * BYTE
+        if (came := host.delivered(made, data)) is not None:
+            last = max(came, last)
+            arrivals.append((last, data))

@@ -105,16 +105,14 @@ class Bag:
 
     def pose(
         self, recorded: float, stamp: float, place: tuple[float, float, float], yaw: float,
-        axis: int = 2, kind: str = "PoseStamped",
+        axis: int = 2,
     ) -> None:  # fmt: skip
         turn = [0.0, 0.0, 0.0, np.cos(yaw / 2)]
         turn[axis] = np.sin(yaw / 2)
         pose = self._types["geometry_msgs/msg/Pose"](
             self._vector("Point", *place), self._vector("Quaternion", *turn)
         )
-        if kind == "PoseWithCovarianceStamped":
-            pose = self._types["geometry_msgs/msg/PoseWithCovariance"](pose, np.zeros(36))
-        message = self._types[f"geometry_msgs/msg/{kind}"](self._header(stamp, "map"), pose)
+        message = self._types["geometry_msgs/msg/PoseStamped"](self._header(stamp, "map"), pose)
         self._rows.append((recorded, "/pose", message))
 
     def write(self, directory: Path, *, sqlite: bool = False) -> Path:

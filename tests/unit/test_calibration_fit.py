@@ -22,7 +22,6 @@ from tests.unit.calibration_robots import (
     SEPARATION,
     Drive,
     Floats,
-    Plan,
     Robot,
     drive,
     slow_squares,
@@ -68,18 +67,14 @@ def test_a_perfect_robot_is_found_exactly(way: str) -> None:
     assert not places or left == pytest.approx(0.998, abs=3e-4)
 
 
-SETS: dict[str, tuple[float, float, Plan | None]] = {
-    "constant track": (1.5, 0.02, None),
-    "no skidding": (1.0, 0.003, None),
-    "manoeuvres": (1.9, 0.05, None),
-}
+SETS = {"constant track": (1.5, 0.02), "no skidding": (1.0, 0.003), "manoeuvres": (1.9, 0.05)}
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", SETS)
 def test_standard_deviations_are_as_wide_as_the_errors(kind: str) -> None:
     """The gyro has a scale error of 0.4 %, which is part of the track's deviation."""
-    chi, slip, _ = SETS[kind]
+    chi, slip = SETS[kind]
     tracks, ratios = [], []
     for seed in range(20):
         rng = np.random.default_rng(seed)
