@@ -14,10 +14,9 @@ from acsard.core.values import (
     Refusal,
     Request,
     Twist,
-    WheelSpeeds,
 )
 from tests.each import each
-from tests.unit.rig import GO, MS, ROLLING, ZERO_LINE, Rig
+from tests.unit.rig import GO, MS, Rig
 
 
 def near(*values: float) -> object:
@@ -45,13 +44,6 @@ def test_the_line_has_the_wheel_speeds_of_the_applied_twist() -> None:
     assert out.speeds.as_tuple() == pytest.approx((9.0, 3.0, 3.0, 9.0))
 
 
-def test_a_silent_commander_is_followed_until_its_timeout_and_then_ramped_to_zero() -> None:
-    rig = Rig().driving()
-    assert rig.path(25) == [0.5] * 25
-    assert rig.path(51) == near(*(max(0.5 - 0.01 * step, 0.0) for step in range(1, 52)))
-    assert (rig.mode, rig.out.line, rig.out.code) == ("ready", ZERO_LINE, "no_command")
-
-
 @each(("refused_ms", "mode"), [(502, "ready"), (2, "ready"), (0, "driving")])
 def test_a_refused_message_disarms_only_the_zeros_before_it(refused_ms: int, mode: str) -> None:
     rig = Rig().linked()
@@ -76,42 +68,6 @@ def test_a_lost_port_sets_zero_in_the_same_step_and_a_zero_sent_meanwhile_arms_n
     rig.step(REST)
     rig.step(superseded=True)
     rig.replug().step(GO)
-    assert rig.drives()
-
-
-def test_a_silent_board_gets_only_zeros_ten_times_a_second() -> None:
-    rig = Rig().driving()
-    rig.reply = None
-    assert rig.path(10, GO) == [0.5] * 10
-    out = rig.step(GO)
-    assert (out.applied, out.link, out.mode, out.code) == (
-        REST, "stale", "waiting", "simulator_fault",
-    )  # fmt: skip
-    lines = [out.line, *(out.line for out in rig.each(99, GO))]
-    assert [index for index, line in enumerate(lines) if line] == list(range(0, 100, 10))
-    assert {line for line in lines if line} == {ZERO_LINE}
-
-
-def test_three_good_lines_after_the_question_make_the_robot_ready() -> None:
-    rig = Rig()
-    outs = [rig.step(REST), *rig.each(5, GO)]
-    assert [(out.link, out.linked) for out in outs] == [("booting", False)] * 4 + [("up", True)] * 2
-    assert {out.mode for out in outs[:4]} == {"waiting"}
-    assert [out.line for out in outs[:4]] == [ZERO_LINE, b"?\r\n", ZERO_LINE, ZERO_LINE]
-    rig = Rig()
-    rig.reply = None
-    assert [out.line for out in rig.each(2)] == [ZERO_LINE, None]
-
-
-def test_after_a_short_gap_the_robot_ramps_up_from_zero_and_after_a_long_one_needs_a_zero() -> None:
-    rig = Rig().driving()
-    reply, rig.reply = rig.reply, None
-    rig.run(50, GO)
-    rig.reply = reply
-    assert rig.path(5, GO) == near(0.0, 0.0, 0.01, 0.02, 0.03)
-    rig.reply = None
-    rig.run(101, GO)
-    rig.reply = reply
     assert rig.drives()
 
 
@@ -176,35 +132,12 @@ def test_a_line_superseded_before_the_port_was_lost_does_not_bring_its_speed_bac
 # the pose and the settings
 
 
-def test_odometry_follows_the_wheels() -> None:
-    rig = Rig(watched=True).linked()
-    rig.reply = rig.codec.encode(ROLLING)
-    (estimate,) = rig.run(100).estimates
-    # 0.5 m/s for 1 s
-    assert estimate.pose.x == pytest.approx(0.5)
-    assert estimate.twist == Twist(0.5, 0.0)
-    assert estimate.positions == pytest.approx((10.0,) * 4)
-    assert estimate.covariance.xx == pytest.approx(1e-6 + 0.5e-4, rel=0.05)  # 1e-4 m2 per metre
-    snapshot = rig.snapshot
-    assert (snapshot.pose, snapshot.measured) == (estimate.pose, estimate.twist)
-    assert snapshot.speeds == ROLLING
-    # No jump over a lost port.
-    rig.unplug().step(ms=3000)
-    assert rig.replug().step(ms=3000).estimates[-1].pose.x == pytest.approx(
-        estimate.pose.x, abs=0.01
-    )
-    rig.run(60)
-    before = rig.robot.travelled
-    rig.reply = rig.codec.encode(WheelSpeeds(-10.0, -10.0, -10.0, -10.0))
-    rig.run(100)
-    assert rig.robot.travelled == pytest.approx(before + 0.5, abs=0.03)  # forwards and backwards
-
-
 def test_the_pose_is_set_by_request_and_the_robot_drives_on() -> None:
     rig = Rig().driving()
     assert rig.answer("set_pose", Pose(1.0, 2.0, 0.5)).success
     out = rig.step(GO)
     assert (out.estimates[-1].pose, out.mode, out.applied) == (Pose(1.0, 2.0, 0.5), "driving", GO)
+    assert rig.robot.travelled == 0.0
     assert rig.answer("reset_odometry").success
     assert rig.step().estimates[-1].pose == Pose()
 

@@ -149,21 +149,6 @@ def test_a_drive_that_ends_repeats_its_zero_for_two_seconds_at_most() -> None:
     assert len(drive.robot.sent[sent:]) == pytest.approx(41, abs=1)
 
 
-@each("key", ["i", "\x1b[A"])
-def test_keys_that_a_stalled_connection_held_back_do_not_drive(key: str) -> None:
-    drive = Drive()
-    drive.step("i", times=5)
-    waited = 151 * key
-    reads = [waited[at : at + 64] for at in range(0, len(waited), 64)]  # as a terminal gives them
-    sent = len(drive.robot.sent)
-    for read in reads:
-        drive.ride.step(read)
-        drive.now += 0.005
-    drive.step(times=20)
-    assert set(drive.robot.sent[sent:]) == {0.0}
-    assert drive.step(key, times=3)[-1] == 0.5
-
-
 @each("asleep", [60.0, 0.0])
 @each("reads", [[""], ["i"], [8 * "i"], [64 * "i", "ii"]])
 def test_a_key_that_was_pressed_before_or_in_a_stall_does_not_drive_after_it(

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from itertools import pairwise
-
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -20,7 +18,7 @@ from acsard.core.motion.battery import (
 from acsard.core.motion.latches import after_restart
 from acsard.core.values import BatteryLevel, BatteryStatus
 from tests.each import each
-from tests.unit.rig import GO, Rig
+from tests.unit.rig import Rig
 
 MS = 1_000_000
 CONFIG = BatteryConfig(warning_below=21.5, stop_below=21.0)
@@ -251,25 +249,6 @@ def test_a_stop_level_is_forgotten_unless_the_new_board_reports_the_measure() ->
 
 FULL, EMPTY = b"!status volts=24.00\r\n", b"!status volts=19.00\r\n"
 GUARDED = Config(battery=BatteryConfig(warning_below=22.0, stop_below=21.0))
-
-
-def test_an_empty_battery_ramps_to_rest_and_each_level_is_an_event() -> None:
-    rig = Rig(GUARDED, status=FULL).driving(steps=500)
-    assert rig.snapshot.battery == BatteryStatus("ok", rig.now_ns, 24.0, mean=24.0)
-    rig.board(EMPTY)
-    outs = rig.each(1000, GO)
-    events = [(e.name, e.level) for out in outs for e in out.events if "battery" in e.name]
-    assert events == [("battery", "warning"), ("battery_stop", "error")]
-    assert sum(out.status_changed for out in outs) == 2
-    path = [out.applied.linear for out in outs if out.mode != "driving"]
-    drop = GUARDED.limits.linear_stop_deceleration / 100
-    assert path[0] == pytest.approx(0.5 - drop)
-    assert all(a - b <= drop + 1e-9 for a, b in pairwise(path))
-    assert (path[-1], rig.out.code) == (0.0, "battery_empty")
-    assert not rig.answer("clear").success
-    assert rig.board(FULL).run(800, GO).mode == "stopped"
-    assert rig.answer("clear").success
-    assert rig.drives()
 
 
 def test_after_a_restart_clear_waits_for_a_report() -> None:

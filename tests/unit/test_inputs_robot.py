@@ -23,18 +23,6 @@ def test_a_press_that_was_released_in_the_same_read_stays_a_stop() -> None:
     assert {(o.mode, o.line, o.code) for o in outs} == {("stopped", ZERO_LINE, "emergency_stop")}
 
 
-def test_a_button_that_falls_silent_counts_as_pressed_even_without_a_port() -> None:
-    rig = Rig(status=OK).linked().unplug()
-    assert {out.mode for out in rig.each(50)} == {"waiting"}
-    assert (rig.step().mode, rig.snapshot.estop) == ("stopped", "silent")
-    rig = Rig(status=OK).linked()  # also if the port reopens again and again
-    rig.reply = None
-    for _ in range(12):
-        rig.unplug().step()
-        rig.replug().run(10)
-    assert (rig.mode, rig.snapshot.estop) == ("stopped", "silent")
-
-
 def test_wheels_that_roll_without_power_cause_no_fault() -> None:
     rig = Rig(watched=True)
     rig.linked().step(REST)
@@ -71,8 +59,8 @@ def test_status_lines_are_no_replies_and_damaged_ones_change_nothing() -> None:
 # bumpers
 
 FREE, FRONT, REAR, BOTH = [b"!status bumpers=%b\r\n" % m for m in (b"..", b"X.", b".X", b"XX")]
-AWAY = Config(safety=SafetyConfig(bumpers=("front", "rear"), bumper="away"))
 BACK = Twist(-0.5, 0.4)
+AWAY = Config(safety=SafetyConfig(bumpers=("front", "rear"), bumper="away"))
 
 
 def test_a_bumper_that_limits_stops_once_and_then_allows_the_retreat() -> None:
@@ -136,37 +124,6 @@ def test_a_driver_fault_counts_if_it_was_reported_before_the_press(
     if before:
         rig.board(before + DRIVER_OK).step()
     assert rig.board(lines).step().mode == mode
-
-
-@each("restarted", [False, True])
-def test_drivers_without_power_after_a_press_block_the_clear_until_they_recover(
-    restarted: bool,
-) -> None:
-    rig = Rig(status=OK + DRIVER_OK).linked()
-    rig.board(PRESSED).step()
-    if restarted:
-        rig = Rig(latches=after_restart(rig.out.latches), status=OK + FAULT).linked()
-    rig.board(OK + DRIVER_OK).step()
-    assert rig.board(OK + FAULT).step().mode == "stopped"
-    assert not rig.answer("clear").success
-    rig.board(OK + DRIVER_OK).step()
-    assert rig.answer("clear").success
-    assert rig.board(OK + FAULT).step().mode == "fault"
-
-
-def test_a_driver_fault_while_nobody_knows_of_a_press_does_not_count_and_then_does() -> None:
-    silent = Rig(status=OK + DRIVER_OK).linked()
-    assert silent.board(b"").run(60).mode == "stopped"
-    assert silent.board(FAULT + OK + DRIVER_OK).step().mode == "stopped"
-    silent.board(OK).step()
-    assert silent.board(OK + FAULT).step().mode == "fault"
-    never_ok = Rig(status=OK).linked()
-    never_ok.board(PRESSED).step()
-    never_ok.board(OK).step()
-    assert never_ok.answer("clear").success
-    assert never_ok.board(OK + FAULT).step().mode == "fault"
-    ignored = Rig(Config(safety=SafetyConfig(estop="off")), status=PRESSED + FAULT)
-    assert ignored.linked().mode == "fault"
 
 
 # another board, or a restart

@@ -18,7 +18,7 @@ from acsard.daemon.latencies import (
     LastMinuteCount,
     Stopwatch,
 )
-from acsard.daemon.pacing import MAX_IDLE_WAKES, REPLY_TIME_NS, Pace
+from acsard.daemon.pacing import REPLY_TIME_NS, Pace
 
 BUCKET = 10 ** (1 / PER_DECADE)
 """Upper end of a bucket divided by its lower end: 1.122."""
@@ -154,20 +154,6 @@ def ticked() -> Paced:
     return paced
 
 
-def test_an_early_line_keeps_the_minimum_gap() -> None:
-    paced = ticked()
-    assert not paced.at_once(GAP_NS - 1)
-    assert paced.at_once(GAP_NS)
-
-
-def test_an_early_line_replaces_the_line_of_the_next_period() -> None:
-    paced = ticked()
-    assert paced.hears(6 * MS)
-    assert not paced.hears(9 * MS), "one early line in a period"
-    assert not paced.ticks(10 * MS)
-    assert paced.ticks(20 * MS)
-
-
 def test_a_failed_early_line_does_not_replace_the_periodic_line() -> None:
     paced = ticked()
     assert paced.hears(6 * MS, goes=False)
@@ -175,26 +161,6 @@ def test_a_failed_early_line_does_not_replace_the_periodic_line() -> None:
     assert paced.retry_ns is None
     assert not paced.pace.early
     assert paced.ticks(10 * MS)
-    assert paced.pace.early
-
-
-def test_a_command_within_the_minimum_gap_is_sent_as_soon_as_the_gap_has_passed() -> None:
-    paced = ticked()
-    assert not paced.hears(1 * MS)
-    assert paced.retry_ns == GAP_NS
-    assert not paced.pace.early, "the retry sends the newest command anyway"
-    assert paced.hears(GAP_NS)
-    assert paced.retry_ns is None
-
-
-def test_messages_without_effect_wake_the_loop_a_limited_number_of_times_a_period() -> None:
-    paced = ticked()
-    for _ in range(MAX_IDLE_WAKES):
-        paced.hears(5 * MS, news=False)
-        assert paced.pace.early
-    paced.hears(5 * MS, news=False)
-    assert not paced.pace.early
-    paced.ticks(10 * MS)
     assert paced.pace.early
 
 

@@ -241,13 +241,6 @@ def test_a_board_that_names_itself_has_restarted(mcu: McuConfig) -> None:
     assert (booting.session.restarted, booting.names) == (True, ["link_booting"])
 
 
-def test_the_name_of_the_board_answers_the_question_and_is_no_restart() -> None:
-    bench = LinkBench().open()
-    bench.waits(3, GOOD)  # the third one comes with the name
-    assert not bench.session.restarted
-    assert bench.waits(1, GOOD + GOOD) == "up"
-
-
 # echoes
 
 
@@ -267,18 +260,6 @@ def test_a_returned_question_counts_only_while_an_answer_may_come() -> None:
     bench.wait(1000, GOOD)
     bench.wait(10, b"?\r\n")
     assert (bench.link, bench.session.rejects) == ("up", {"echo": 1})
-
-
-def test_lines_that_return_during_a_drive_raise_the_question_after_a_change_of_speed() -> None:
-    bench = LinkBench().up()
-    assert b"?\r\n" not in bench.echoed(0.0, 300)  # every board at rest repeats zeros
-    assert bench.echoed(1.0, 100).count(b"?\r\n") == 1
-    assert (bench.link, bench.why.code) == ("stale", "echo")
-    bench = LinkBench().up()  # measured speeds raise none
-    for n in range(600):
-        line = bench.line(WheelSpeeds(n / 100, 0.0, 0.0, 0.0))
-        assert line not in (None, b"?\r\n")
-        bench.wait(10, line if line and n % 8 else GOOD)
 
 
 @each("encoders", [True, False])

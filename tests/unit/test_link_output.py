@@ -134,40 +134,6 @@ def test_a_session_begins_with_a_plain_stop_and_the_question_follows_the_first_l
     assert bench.line() != b"?\r\n"
 
 
-def test_a_silent_board_gets_a_stop_without_delay_and_then_ten_a_second() -> None:
-    bench = LinkBench().up()
-    assert bench.line(STILL) == STOP
-    while not bench.session.silent(bench.now_ns):
-        assert bench.line() == b"ap01.00,bp01.00,cp01.00,dp01.00\r\n"
-        bench.wait(10)
-    assert bench.line() == STOP
-    lines = []
-    for _ in range(100):
-        bench.wait(10)
-        lines.append(bench.line())
-    assert [line for line in lines if line] == [STOP] * 10
-    # A board that reports by its own clock gets no more time behind a late step: its lines would
-    # wait in the kernel.
-    free = LinkBench(McuConfig(reply_period=0.02)).up()
-    free.wait(150)
-    assert free.link == "stale"
-
-
-def test_a_closed_port_is_offered_ten_stops_a_second_and_one_when_it_opens() -> None:
-    bench = LinkBench()
-    made = []
-    for _ in range(100):
-        bench.update(False)
-        made.append(bench.line())
-    assert len([line for line in made if line]) == 10
-    bench.open().update(False)
-    assert bench.line() == STOP
-    bench.update(False)
-    assert bench.line() == STOP  # it was not sent
-    bench.update(True)
-    assert bench.line() is None
-
-
 # a blocked output
 
 
@@ -180,23 +146,6 @@ def blocked(ms: float) -> LinkBench:
         bench.line()
         bench.update(False, 10, GOOD)
     return bench
-
-
-def test_an_output_that_is_blocked_for_the_watchdog_time_makes_the_link_stale() -> None:
-    bench = blocked(290)
-    assert (bench.link, bench.session.blocked) == ("up", False)
-    bench.line()
-    bench.update(False, 20, GOOD)
-    assert (bench.link, bench.session.blocked, bench.names) == ("stale", True, ["link_stale"])
-    assert bench.why.code == bench.session.events[0].code == "port_blocked"
-    bench.close().wait(10)
-    assert not bench.session.blocked
-    late = LinkBench().up()  # a late step is no block
-    late.line()
-    late.update(False, 400, GOOD)
-    late.line()
-    late.update(True, 10, GOOD)
-    assert not late.session.blocked
 
 
 # when rest was commanded

@@ -77,21 +77,6 @@ def test_it_comes_after_three_seconds_and_again_only_when_it_changes() -> None:
     assert not hearing.judge(10 * FIRST_DIAGNOSIS_NS)
 
 
-def test_noise_or_silence_is_the_reason_of_the_link() -> None:
-    bench, codes = LinkBench().open(), []
-    for tick in range(400):
-        bench.wait(10, *([b"\x00\xff~" + GOOD] if tick % 2 else []))
-        codes += [event.code for event in bench.session.events if event.name == "link_booting"]
-    assert codes.count("received_foreign") == 1
-    found = [bench.why.code]
-    bench.wait(10, GOOD * 3)
-    found.append(bench.why.code)
-    for steps in (20, 302):
-        bench.waits(steps)
-        found.append(bench.why.code)
-    assert found == ["received_foreign", "link_up", "simulator_fault", "received_nothing"]
-
-
 @each(
     ("apart", "longest", "code"),
     [
@@ -171,21 +156,6 @@ def sparse(bench: LinkBench) -> str:
     assert heard is not None
     assert heard.code == "received_sparse"
     return heard.diagnosis().code
-
-
-def test_only_a_stall_within_the_time_of_sparse_lines_explains_them() -> None:
-    bench = LinkBench(BOARD).up()
-    bench.wait(2000, GOOD * 3)
-    assert bench.waits(400, GOOD) == "up"
-    assert bench.waits(11) == "stale"
-    assert sparse(bench) == "received_sparse"
-    bench = LinkBench(BOARD).up().close()  # nor is a closed port a stall
-    bench.waits(400)
-    assert sparse(bench.open()) == "received_sparse"
-    bench = LinkBench(BOARD).open()
-    bench.wait(10)
-    bench.wait(800)
-    assert sparse(bench) == "host_late"
 
 
 # lines without an answer

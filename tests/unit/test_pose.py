@@ -83,17 +83,6 @@ def test_yaw_stays_within_half_a_turn(turns: list[float]) -> None:
     assert same_pose(robot.pose, (0.0, 0.0, sum(turns)), 1e-8)
 
 
-def test_each_wheel_turns_by_its_own_speed() -> None:
-    robot = Odometer()
-    robot.fold(Feedback(AT, WheelSpeeds(1.0, 2.0, -3.0, 4.0), 0.05))
-    estimate = robot.fold(Feedback(AT, WheelSpeeds(1.0, 0.0, -1.0, 0.0), 0.025))
-    assert estimate.positions == pytest.approx((0.075, 0.1, -0.175, 0.2))
-    assert (estimate.at, estimate.speeds) == (AT, WheelSpeeds(1.0, 0.0, -1.0, 0.0))
-    odometry = robot.odometry
-    now = (estimate.twist, estimate.speeds, estimate.pose)
-    assert (odometry.twist, odometry.speeds, odometry.pose) == now
-
-
 # counts
 
 

@@ -117,15 +117,3 @@ def test_impossible_speeds_of_any_wheel_are_one_cause_and_hide_no_later_cause() 
     rig.step(GO, guard_trip="guard_too_fast")
     newest, second = rig.robot.latches.of("fault")
     assert (newest.code, second) == ("guard_too_fast", first)
-
-
-# the end
-
-
-def test_shutting_down_ramps_to_zero_by_the_stop_deceleration_and_stays_there() -> None:
-    rig = Rig().driving()
-    rig.shutting_down = True
-    path = rig.path(20, GO)
-    assert path[:3] == pytest.approx([0.47, 0.44, 0.41])
-    assert path[17:] == [0.0, 0.0, 0.0]
-    assert (rig.mode, rig.out.code) == ("shutdown", "shutting_down")

@@ -261,19 +261,6 @@ def test_speeds_without_effect_for_three_seconds_are_one_warning() -> None:
     assert said(CommandEvents(Mode.STOPPED), Mode.STOPPED, late) == []
 
 
-def test_a_source_held_up_by_zeros_is_one_warning_however_often_it_pauses() -> None:
-    told = CommandEvents(Mode.READY)
-    told.changes(Mode.DRIVING, by("app", "joe"), Reason("commanded", ""))
-
-    def zeros(kept: str) -> list[tuple[str, str]]:
-        return said(told, Mode.DRIVING, by("app", "joe", Wait("zeros", "app", lasts=3, kept=kept)))
-
-    assert zeros("") == []
-    assert zeros("nav") == [("commands_without_effect", "nav")]
-    assert zeros("") + zeros("nav") == []
-    assert zeros("teleop") == [("commands_without_effect", "teleop")]
-
-
 def test_a_refusal_is_an_event_with_its_reason_and_its_sender() -> None:
     sender, cut = "joe" * 100, ("joe" * 100)[:MAX_SENDER_LENGTH]
     event = refused(Refusal("stale", "late", "app", sender))
