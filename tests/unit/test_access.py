@@ -29,7 +29,7 @@ from acsard.core.config.settings import (
 )
 from acsard.core.messages.keys_and_roles import SERVICES, TOPICS, full_key, whoami_key
 from acsard.core.messages.permissions import SERVICE_ROLES
-from acsard.core.ros.transports import claims, endpoints
+from acsard.core.ros.transports import endpoints
 from acsard.core.values import Role
 from tests.each import each
 from tests.permissions import (
@@ -180,17 +180,6 @@ def test_over_tls_each_certificate_commands_only_on_its_own_keys() -> None:
                 own = subject == name and subject != "wall"
                 assert gateway.lets(subject, "put", gateway.key(f"{kind}/app/{name}")) == own
             assert not gateway.lets(subject, "put", gateway.key(f"{kind}/app"))
-
-
-def test_a_router_forwards_commands_with_a_certificate_and_tokens_of_other_daemons() -> None:
-    for role in ROLES:
-        drives = role != "viewer"
-        assert DEFAULT.lets(role, "put", DEFAULT.key("cmd/app/anna")) == drives
-        assert not DEFAULT.lets(role, "put", DEFAULT.key("cmd/ghost/anna"))
-        assert not DEFAULT.lets(role, "put", DEFAULT.key("cmd/app"))
-    for token in (DEFAULT.key("alive"), *claims(RosConfig())):
-        assert DEFAULT.who("liveliness_token", token) == KEEPERS
-        assert DEFAULT.lets("maintainer", "declare_liveliness_subscriber", token, "egress")
 
 
 def test_a_gyro_is_put_by_a_maintainer_and_only_if_the_robot_uses_it() -> None:

@@ -318,14 +318,6 @@ def test_renew_replaces_that_certificate_alone_and_keeps_its_names(own: Path, na
     assert names_of(place) == {*names, "10.0.0.9"} > kept
 
 
-def test_renew_leaves_out_a_name_of_the_machine_that_the_authority_may_not_sign(
-    own: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("acsard.machine.certificates.own_addresses", lambda: ["203.0.113.99"])
-    assert tls("renew", "--directory", str(own)) == 0
-    assert "203.0.113.99" not in names_of(own)
-
-
 def encrypt(own: Path, password: bytes) -> None:
     key = load_pem_private_key((own / "ca-key.pem").read_bytes(), None)
     (own / "ca-key.pem").write_bytes(
@@ -360,29 +352,6 @@ def test_an_encrypted_authority_without_a_terminal_is_refused_with_the_reason(ow
     done = subprocess.run(words, input="secret\n", capture_output=True, text=True, timeout=30.0)
     assert (done.returncode, "encrypted" in done.stderr) == (Exit.USAGE, True)
     assert "Traceback" not in done.stderr
-
-
-def test_the_printed_lines_are_those_that_write_writes(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    """Without --write, `tls init` must also read acsard.toml.
-
-    The file may contain a TLS endpoint whose certificates do not exist yet.
-    """
-    monkeypatch.chdir(tmp_path)
-    text = '[bus]\nlisten = ["tcp/127.0.0.1:9", "tls/0.0.0.0:99"]\n'
-    for before in ('[bus]\nlisten = ["tcp/127.0.0.1:9"]\n', text):
-        Path("acsard.toml").write_text(before)
-        assert tls("init", "--force", "--directory", "tls") == 0
-        output = capsys.readouterr().out
-        printed = parse(tables(output)).bus
-        port = printed.listen[1].rpartition(":")[2]
-        assert f".local:{port} --tls" in output
-        Path("acsard.toml").write_text(f'{before}tls = "/old"\n')
-        words = ("--directory", "tls", "--write", "acsard.toml")
-        assert tls("init", "--force", *words) == 0
-        capsys.readouterr()
-        assert parse(Path("acsard.toml").read_bytes()).bus == printed
 
 
 def test_init_in_a_loop_of_symbolic_links_says_why(

@@ -130,17 +130,6 @@ def test_without_the_time_a_token_is_valid_only_for_its_days_of_running(
     assert not valid[-1]
 
 
-def test_an_expired_token_is_refused_while_the_server_runs_without_reading_the_file(
-    tmp_path: Path, clocks: Clocks
-) -> None:
-    text, token = Vault(tmp_path, "robot1").invite("maintainer", "me", 1)
-    clocks.restart()
-    tokens = read(Vault(tmp_path, "robot1"))  # and never again
-    assert tokens.left_s(token.digest) == DAY_S
-    clocks.advance(DAY_S)
-    assert tokens.owner([text]) is None
-
-
 def test_an_invitation_without_the_time_is_valid_for_its_days_after_the_clock_is_set(
     tmp_path: Path, clocks: Clocks
 ) -> None:
@@ -153,23 +142,6 @@ def test_an_invitation_without_the_time_is_valid_for_its_days_after_the_clock_is
     assert owner(server, text) is not None
     clocks.wall_s = now_s + 3600.0  # the network has come
     assert owner(server, text) is not None
-
-
-def test_the_time_is_written_each_minute_at_most_and_never_without_a_file(
-    tmp_path: Path, clocks: Clocks
-) -> None:
-    server = Vault(tmp_path, "robot1")
-    for _ in range(100):
-        digests(server)
-        clocks.advance(1.0)
-    assert not server.path.exists()
-    Vault(tmp_path, "robot1").invite("viewer", "tv", 1)
-    contents = set[bytes]()
-    for _ in range(600):
-        digests(server)
-        contents.add(server.path.read_bytes())
-        clocks.advance(1.0)
-    assert len(contents) == 10
 
 
 def test_a_disk_that_cannot_store_the_time_leaves_the_tokens_valid(

@@ -14,7 +14,6 @@ from acsard.core.incoming.queries import Reply
 from acsard.core.messages.keys_and_roles import IMU
 from acsard.daemon.bus.inbox import (
     COMMAND_BUFFER,
-    GYRO_BUFFER,
     MAX_DISPLACED,
     MAX_OPEN_QUERIES,
     Inbox,
@@ -115,13 +114,6 @@ def test_the_newest_displaced_command_of_each_sender_is_returned_for_16_senders(
         inbox._put(inbox._buffer("cmd/app"), arrival)
     lost = {arrival.sender: arrival.arrived_ns for arrival in inbox.take(8).displaced}
     assert lost == {f"session {number}": 40 + number for number in range(MAX_DISPLACED)}
-
-
-def test_a_displaced_gyro_sample_or_command_of_no_source_is_only_counted() -> None:
-    inbox, _ = an_inbox()
-    arrived(inbox, *[IMU] * (GYRO_BUFFER + 1), *["cmd/unlisted"] * (COMMAND_BUFFER + 1))
-    batch = inbox.take(8)
-    assert (batch.overrun, batch.displaced) == (2, ())
 
 
 @pytest.mark.parametrize(("rate_hz", "room"), [(10.0, 160), (20.0, 80), (100.0, 16), (300.0, 16)])

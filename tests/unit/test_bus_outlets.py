@@ -185,31 +185,6 @@ class Puts:
         return self._now_ns
 
 
-def test_feedback_is_sent_by_the_control_loop_itself_and_in_order(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    Puts(monkeypatch)
-    feedback = Feedback(publisher := Publisher())
-    publisher.free.set()
-    feedback.heard(1, 2)
-    assert publisher.sent == [1, 2]
-    assert publisher.threads == {threading.get_ident()}
-    feedback.outlets.stop(WAIT_S)
-
-
-def test_the_control_loop_never_sends_feedback_itself_if_a_client_can_block_the_bus() -> None:
-    """The bus is blocked before the first message, which would cost periods."""
-    feedback = Feedback(publisher := Publisher(), direct=False)
-    feedback.heard(0)
-    assert publisher.entered.wait(WAIT_S)
-    for number in range(1, 100):
-        feedback.heard(number)
-    publisher.free.set()
-    feedback.outlets.stop(WAIT_S)
-    assert publisher.sent == [0, *range(100 - SLOT_MESSAGES, 100)]
-    assert threading.get_ident() not in publisher.threads
-
-
 def test_after_a_slow_put_the_thread_sends_feedback_until_it_is_fast_again(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

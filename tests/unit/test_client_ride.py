@@ -10,7 +10,6 @@ from acsard.client.ride import (
     OPENING_PERIOD_S,
     SEND_PERIOD_S,
     SLOWS_S,
-    STALE_S,
     Ride,
 )
 from acsard.core.messages.schema import RobotState, SourceState
@@ -69,12 +68,6 @@ def test_a_wish_is_repeated_while_it_is_wanted_and_a_newer_one_replaces_it_at_on
     rider.wish(AHEAD, 1.0)
     assert rider.wish(AHEAD, 1.0) == [AHEAD] * round(1.0 / SEND_PERIOD_S)
     assert rider.wish(LEFT, 0.01) == [LEFT]
-
-
-def test_a_program_that_wishes_nothing_new_sends_no_speed() -> None:
-    rider = Rider()
-    rider.wish(AHEAD, 1.0)
-    assert rider.ride.due(rider.now + STALE_S) == REST
 
 
 def test_an_objection_ends_the_ride_until_the_person_lets_go() -> None:
@@ -160,14 +153,3 @@ def test_zeros_end_if_something_else_moves_the_robot_or_its_speed_is_unknown(
     rider.shows = state
     zeros = len(rider.wish(None, 5.0)) * SEND_PERIOD_S
     assert SLOWS_S <= zeros < SLOWS_S + 0.5
-
-
-def test_zeros_go_on_while_the_robot_slows_down() -> None:
-    rider = Rider(MOVING)
-    rider.wish(AHEAD, 1.0)
-    for tenths in range(50, 0, -1):
-        rider.shows = replace(MOVING, linear=tenths / 100, angular=0.0)
-        assert rider.wish(None, 0.1)
-    rider.shows = RESTING
-    rider.wish(None, 0.2)
-    assert rider.wish(None, 5.0) == []

@@ -14,8 +14,6 @@ from acsard.core.formatting import (
     json_line,
     lasting,
     lines,
-    listed,
-    many,
     printable,
     printable_bytes,
     rough,
@@ -105,18 +103,6 @@ def test_news_is_reported_at_once_until_it_comes_too_often_and_again_after_a_pau
     assert tally.lines([again], 10 * MS) == ()
     (line,) = tally.lines([first], 20 * MS)
     assert (line.text, line.by, line.count) == ("2 times; the last: active", "ann, joe", 2)
-
-
-def test_two_joined_lines_have_the_total_count_and_the_last_text() -> None:
-    kind = "12 x stale; the last"
-    first = Event("command_refused", f"{kind}: late", "info", "joe, ann", kind, 12)
-    kind = "3 x wildcard"
-    other = Event("command_refused", f"{kind}: a star", "warning", "ann, eve", kind, 3)
-    line = merge(first, other)
-    assert (line.text, line.count) == ("15 times; the last: a star", 15)
-    assert (line.by, line.level) == ("joe, ann, eve", "warning")
-    assert merge(line, refused()).text == "16 times; the last: late"
-    assert merge(refused(), line).text == "16 times; the last: a star"
 
 
 events = st.builds(
@@ -226,14 +212,6 @@ def test_a_number_is_shown_with_its_sign_in_a_fixed_width(value: float, text: st
     for long in (1000.0, -123456.0, 1e12):
         assert len(signed(long, 2, 5)) == 5
         assert float(signed(long, 2, 5)) == pytest.approx(long, rel=0.5)
-
-
-def test_counts_and_lists_in_words() -> None:
-    assert [many(count, "line") for count in (0, 1, 2)] == ["no lines", "1 line", "2 lines"]
-    assert many(2, "change of commander") == "2 changes of commander"
-    assert (many(1, "loss", "losses"), many(2, "loss", "losses")) == ("1 loss", "2 losses")
-    assert listed(["a", "b"], 2) == "a, b"
-    assert listed(["a", "b", "c", "d"], 2, "; ") == "a; b; and 2 more"
 
 
 @law

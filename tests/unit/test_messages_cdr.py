@@ -6,7 +6,6 @@ CDR allows any padding bytes. Both encoders write zeros, so whole payloads can b
 from __future__ import annotations
 
 import math
-import random
 import struct
 import tracemalloc
 from datetime import datetime
@@ -344,19 +343,6 @@ def test_a_sequence_beyond_the_payload_is_refused_before_it_takes_memory(
         tracemalloc.stop()
 
 
-def test_sequences_of_many_lengths_keep_no_memory_per_length() -> None:
-    codec = Cdr(of(list[float]))
-    payloads = [LITTLE + struct.pack(f"<I4x{n}d", n, *[0.5] * n) for n in range(1, 501)]
-    codec.decode(payloads[0])
-    tracemalloc.start()
-    try:
-        for payload in payloads:
-            codec.decode(payload)
-        assert tracemalloc.get_traced_memory()[0] < 100_000
-    finally:
-        tracemalloc.stop()
-
-
 def weight(value: object) -> int:
     """Return the number of list items and characters in a message."""
     if isinstance(value, str):
@@ -367,35 +353,19 @@ def weight(value: object) -> int:
     return sum(weight(getattr(value, name)) for name in fields)
 
 
-def damaged(payload: bytes, dice: random.Random) -> bytes:
-    at = dice.randrange(len(payload))
-    match dice.randrange(4):
-        case 0:
-            return b"%b%c%b" % (
-                payload[:at],
-                payload[at] ^ 1 << dice.randrange(8),
-                payload[at + 1 :],
-            )
-        case 1:
-            return payload[:at] + payload[at + dice.randint(1, 9) :]
-        case 2:
-            return payload[:at] + dice.randbytes(dice.randint(1, 9)) + payload[at:]
-    at -= at % 4  # where the length of a sequence may be
-    length = dice.choice((0, 1, 2, 255, 2**16, 2**31, 2**32 - 1))
-    return payload[:at] + struct.pack(dice.choice("<>") + "I", length) + payload[at + 4 :]
+damage = st.tuples(st.integers(0, 300), st.integers(0, 9), st.binary(max_size=9))
 
 
-@pytest.mark.slow
-def test_damaged_payloads_raise_only_cdr_errors_and_give_no_more_than_their_size() -> None:
-    dice = random.Random(8)
-    payloads = [(by_ros(m, little=little), m) for m in samples() for little in (True, False)]
-    for number in range(20_000):
-        payload, message = payloads[number % len(payloads)]
-        data, codec = damaged(damaged(payload, dice), dice), Cdr[Any](type(message))
-        try:
-            result = codec.decode(data)
-        except CdrError:
-            continue
-        assert weight(result) <= len(data) + 72  # the two covariances have a fixed length
-        again = codec.encode(result)
-        assert codec.encode(codec.decode(again)) == again
+@given(st.sampled_from(samples()), st.booleans(), st.lists(damage, max_size=3))
+def test_a_damaged_payload_gives_a_message_or_a_cdr_error(
+    message: Any, little: bool, damages: list[tuple[int, int, bytes]]
+) -> None:
+    payload, codec = by_ros(message, little=little), Cdr[Any](type(message))
+    for at, lost, more in damages:
+        payload = payload[:at] + more + payload[at + lost :]
+    try:
+        result = codec.decode(payload)
+    except CdrError:
+        return
+    again = codec.encode(result)
+    assert codec.encode(codec.decode(again)) == again

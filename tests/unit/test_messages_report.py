@@ -328,13 +328,6 @@ def test_steps_a_little_early_or_late_do_not_make_the_intervals_uneven(hz: int, 
         assert {b - a for a, b in pairwise(steps[2:])} <= {apart}
 
 
-def test_odom_and_tf_are_published_together_at_a_limited_rate() -> None:
-    report = Report(rates(odom=10.0), START)
-    for step in range(300):
-        keys = [key for key, _ in due(report, at(later(step / 100)), {"odom", "tf"}, get_snapshot)]
-        assert keys in ([], ["odom", "tf"])
-
-
 def test_a_changed_setting_makes_no_message_due_and_counts_from_the_last_message_on() -> None:
     config = rates(odom=20.0, telemetry=10.0)
     for key, most in (("odom", 20), ("wheel_states", 10), ("state", 10), ("battery", 1)):

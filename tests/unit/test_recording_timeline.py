@@ -8,10 +8,6 @@ from __future__ import annotations
 import tempfile
 from functools import cache
 from pathlib import Path
-from typing import Any
-
-import pytest
-from msgspec.structs import replace
 
 from acsard.core.config.parsing import effective
 from acsard.core.config.settings import Config
@@ -123,17 +119,6 @@ def test_a_new_reason_of_the_same_mode_has_an_entry_with_its_source() -> None:
     assert first.endswith("(by app)")
 
 
-def test_reasons_that_alternate_in_every_step_make_an_entry_a_second() -> None:
-    steps = []
-    for step in drive().steps()[:201]:
-        code: Any = f"code{step.number % 2}"
-        words = {"code": code, "reason": f"reason {step.number}"}
-        status = replace(step.recorded.status, mode="ready", **words)
-        steps.append(replace(step, recorded=replace(step.recorded, status=status, events=())))
-    seconds = (steps[-1].now.mono_ns - steps[0].now.mono_ns) / 1e9
-    assert len(texts(entries_of(head(), *steps), "reason")) == pytest.approx(seconds, abs=1)
-
-
 def test_a_source_that_waits_has_an_entry_once_in_a_drive() -> None:
     steps = drive().steps()
     waits = Waits(steps[100].now, {"nav": ("source_priority", "app has priority")})
@@ -170,15 +155,6 @@ def test_the_log_has_the_same_lines_as_the_timeline(tmp_path: Path) -> None:
     assert [line.msg for line in lines] == [entry.sentence for entry in entries]
     assert [line.stamp.to_ns() for line in lines] == [entry.wall_ns for entry in entries]
     assert "start" in [line.name for line in lines]
-
-
-def test_two_runs_of_the_daemon_are_published_one_after_the_other(tmp_path: Path) -> None:
-    path = drive().save(tmp_path / "a.rec.zst")
-    once, twice = (list(published(Recording([path] * n))) for n in (1, 2))
-    # A restarted robot begins at the origin of `odom` again.
-    odom, both = ([m for m in run if m.channel.name == "odom"] for run in (once, twice))
-    assert both == odom * 2
-    assert [line.name for line in logs(twice)].count("start") == 2
 
 
 def test_what_sources_waited_for_before_a_part_is_not_in_its_log(tmp_path: Path) -> None:

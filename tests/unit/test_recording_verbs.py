@@ -7,13 +7,11 @@ import os
 import random
 import time
 from collections import Counter
-from itertools import pairwise
 from pathlib import Path
 
 import pytest
 from msgspec.structs import replace
 
-from acsard.cli.recording import SERVICE_DIRECTORY
 from acsard.core.values import Event
 from acsard.host.errors import Exit
 from acsard.recording.file import MAGIC
@@ -123,22 +121,6 @@ def test_a_time_without_a_recording_is_refused(verb: str, where: Path, tmp_path:
     assert not [*tmp_path.iterdir()]
 
 
-def test_an_export_and_a_report_go_on_across_files(
-    where: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    for words in (["export", "--csv"], ["report"]):
-        code, _, err = log(where, *words, "--from", local(0.5), "--to", local(3.5))
-        assert (code, err) == (0, "")
-    rows = (tmp_path / "000001-20270115T080000Z.csv").read_text().splitlines()[1:]
-    times = [float(row.split(",")[0]) - START.wall_ns / 1e9 for row in rows]
-    assert 0.45 < times[0] < 0.6
-    assert 3.4 < times[-1] <= 3.5
-    assert max(b - a for a, b in pairwise(times)) < 0.05
-    text = (tmp_path / "000001-20270115T080000Z.html").read_text(encoding="utf-8")
-    assert text.count("<td>stopped and latched") == 3
-
-
 def test_a_file_that_is_no_recording_does_not_hide_the_others(where: Path, tmp_path: Path) -> None:
     for path in where.iterdir():
         (tmp_path / path.name).write_bytes(path.read_bytes())
@@ -208,11 +190,3 @@ def test_no_verb_raises_on_truncated_or_damaged_recordings(tmp_path: Path) -> No
     assert min(ends[Exit.OK], ends[Exit.INCOMPLETE]) > HARMED / 4, ends
     code, out, err = log(where, "show", "--from", "2000-01-01")
     assert (code, "  stop: " in out, "Traceback" in err) == (Exit.OK, True, False)
-
-
-def test_the_default_directory_is_that_of_the_service() -> None:
-    unit = Path(__file__).parents[2] / "deploy/systemd/acsard.service"
-    settings = dict(row.partition("=")[::2] for row in unit.read_text().splitlines() if "=" in row)
-    state = Path("/var/lib") / settings["StateDirectory"]
-    assert settings["Environment"] == f"ACSARD_RECORD=%S/{settings['StateDirectory']}/record"
-    assert state / "record" == SERVICE_DIRECTORY

@@ -178,25 +178,28 @@ KEYS = [key for key, _ in flat(effective(Config()))]
 DOUBLE, INTEGER = 3, 2
 
 
-def test_a_settable_parameter_is_described_with_its_range_and_condition() -> None:
-    assert described("limits.linear_stop_deceleration", DOUBLE) == ParameterDescriptor(
-        "limits.linear_stop_deceleration",
-        DOUBLE,
-        "deceleration after a stop or a fault: a number from 0.01 to 100 m/s2",
-        "may be raised at any time, but lowered only while the robot stands",
-        read_only=False,
-        floating_point_range=[FloatingPointRange(0.01, 100.0, 0.0)],
-    )
-
-
-def test_a_parameter_that_needs_a_restart_is_read_only_and_described_so() -> None:
-    assert described("mcu.encoder_counts", INTEGER) == ParameterDescriptor(
-        "mcu.encoder_counts",
-        INTEGER,
-        "a whole number from 0 to 100000 per wheel turn (0 = unknown)",
-        "change it in acsard.toml, then restart the daemon",
-        integer_range=[IntegerRange(0, 100_000, 1)],
-    )
+@each(
+    "expected",
+    [
+        ParameterDescriptor(
+            "limits.linear_stop_deceleration", DOUBLE,
+            "deceleration after a stop or a fault: a number from 0.01 to 100 m/s2",
+            "may be raised at any time, but lowered only while the robot stands",
+            read_only=False, floating_point_range=[FloatingPointRange(0.01, 100.0, 0.0)],
+        ),
+        ParameterDescriptor(
+            "mcu.encoder_counts", INTEGER,
+            "a whole number from 0 to 100000 per wheel turn (0 = unknown)",
+            "change it in acsard.toml, then restart the daemon",
+            integer_range=[IntegerRange(0, 100_000, 1)],
+        ),
+        ParameterDescriptor("no.such", 0),
+    ],
+)  # fmt: skip
+def test_a_parameter_is_described_with_its_range_and_condition(
+    expected: ParameterDescriptor,
+) -> None:
+    assert described(expected.name, expected.type) == expected
 
 
 @each("key", KEYS)

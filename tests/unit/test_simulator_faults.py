@@ -24,7 +24,6 @@ from tests.unit.test_simulator import (
     ZERO,
     Heard,
     drive,
-    joined,
     replies,
 )
 
@@ -91,14 +90,6 @@ def test_a_fault_of_the_report_does_not_change_the_motion(
     assert mcu.valid_lines == 6
 
 
-def test_a_frozen_encoder_keeps_its_last_speed_while_its_wheel_stops() -> None:
-    mcu = FakeMcu(TRUE)
-    drive(mcu, 0, 5)
-    with mcu.frozen_encoder(2):
-        assert drive(mcu, 50 * MS, 5, ZERO)[-1][1] == b"ap00.00,bp00.00,cp15.00,dp00.00\r\n"
-    assert mcu.vehicle.speeds == STILL
-
-
 @pytest.mark.parametrize(
     ("fault", "fed", "drives_s"), [("no_watchdog", b"", 60), ("watchdog_fed_by_bad_lines", b"x", 0)]
 )
@@ -153,40 +144,6 @@ def test_a_free_running_board_reports_by_its_own_clock_unpadded_and_with_a_comma
         assert b"," not in mcu.advance(400 * MS + RESET_NS)
     with mcu.free_running(0.1):  # entered twice, it is not twice as fast
         assert 9 <= mcu.advance(1400 * MS + RESET_NS).count(b"ap0.00") <= 10
-
-
-def arrivals(mcu: FakeMcu) -> Heard:
-    """Return what the host reads each ms from a board that is prompted every 10 ms for 1 s."""
-    chunks = []
-    for ms in range(1200):
-        if ms % 10 == 0 and ms < 1000:
-            mcu.receive(ms * MS, LINE)
-        if data := mcu.advance(ms * MS):
-            chunks.append((ms, data))
-    return chunks
-
-
-@pytest.mark.parametrize(
-    ("ftdi_ms", "stall"), [(16, None), (100, None), (0, (0.5, 0.15)), (16, (0.3, 0.1))]
-)
-def test_an_adapter_and_stalls_delay_the_data_and_lose_none(
-    ftdi_ms: int, stall: tuple[float, float] | None
-) -> None:
-    mcu = FakeMcu(TRUE)
-    with ExitStack() as on:
-        if ftdi_ms:
-            on.enter_context(mcu.ftdi(latency_s=ftdi_ms / 1000))
-        if stall:
-            on.enter_context(mcu.stalls(*stall))
-        chunks = arrivals(mcu)
-    assert joined(chunks) == joined(arrivals(FakeMcu(TRUE)))
-    assert any(len(data) > len(LINE) for _, data in chunks)
-    if stall:
-        every, lasts = (round(1000 * s) for s in stall)
-        assert not [ms for ms, _ in chunks if ms % every < lasts]
-    else:
-        # A full packet of the adapter does not wait.
-        assert {len(data) for ms, data in chunks if ms % ftdi_ms} <= {62}
 
 
 # The switches.

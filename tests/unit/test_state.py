@@ -10,7 +10,7 @@ from typing import get_args
 import pytest
 from msgspec.structs import replace
 
-from acsard.core.config.settings import Config, LimitsConfig, OdometryConfig
+from acsard.core.config.settings import Config, LimitsConfig
 from acsard.core.motion.arbiter_text import MAX_SENDER_LENGTH
 from acsard.core.motion.modes import REFUSALS, Mode, RefusedError, mode_of, require_allowed
 from acsard.core.values import (
@@ -73,11 +73,6 @@ def test_a_mode_refuses_what_would_have_no_effect_and_says_why(mode: Mode, verb:
 
 
 # the status
-
-
-def test_without_a_port_the_robot_waits_and_says_why() -> None:
-    out = Rig().out
-    assert (out.mode, out.link, out.linked, out.code) == ("waiting", "down", False, "port_closed")
 
 
 def test_the_status_changes_with_mode_reason_link_and_source_and_not_otherwise() -> None:
@@ -190,14 +185,6 @@ def test_what_the_wheels_do_is_reported_and_counted() -> None:
         assert rig.counters[counter] >= 1
 
 
-def test_a_sample_of_the_gyro_is_kept_if_the_robot_uses_one() -> None:
-    for uses in (True, False):
-        rig = Rig(Config(odometry=OdometryConfig(gyro=uses))).linked()
-        before = rig.snapshot.gyro
-        rig.step(gyro=0.0)
-        assert (rig.snapshot.gyro != before) is uses
-
-
 # events
 
 
@@ -240,13 +227,6 @@ def test_a_refused_command_is_reported_with_its_reason_and_its_sender() -> None:
     events = [e for out in Rig().linked().each(150, refusals=(refusal,)) for e in out.events]
     assert [event.count for event in events] == [1, 100]
     assert {(e.code, e.by) for e in events} == {("malformed", "a" * MAX_SENDER_LENGTH)}
-
-
-def test_missed_periods_are_reported_with_their_number() -> None:
-    rig = Rig().linked()
-    out = rig.step(ms=50, missed=4)
-    assert [(event.name, event.count) for event in out.events] == [("missed_periods", 4)]
-    assert rig.counters["missed_periods"] == 4
 
 
 def test_a_speed_limit_applies_until_it_ends_and_each_change_is_an_event() -> None:
