@@ -14,7 +14,7 @@ from acsard.core.link.codec import Motors
 from acsard.core.link.feedback import Feedback
 from acsard.core.motion.gyro import Gyro, Turn
 from acsard.core.motion.uncertainty import ErrorModel
-from acsard.core.motion.wheels import NOTHING, Wheels, new_wheels
+from acsard.core.motion.wheels import Wheels, new_wheels
 from acsard.core.values import Event, GyroStatus, Seconds, WheelsStatus
 
 NO_ENCODERS = "feedback.encoders = false: the pose is what was commanded"
@@ -52,7 +52,6 @@ class ConsistencyChecks(Struct):
             event = gyro.event()
         self.turn = turn
         feedback = model.feedback
-        wheels.steps = line.steps if line.turned is None else NOTHING
         wheels.add(
             rolled, line.speeds, seconds, by_gyro, feedback, model.kinematics, model.wheel_count
         )

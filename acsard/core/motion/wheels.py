@@ -58,9 +58,7 @@ LEAST_SPEED = 0.05  # m/s, of a runaway that must not look like rest
 # Times the largest output of the limiter, and rad and counts rolled beyond that, both of them: a
 # sound wheel shows up to a count more than it turned.
 TOO_FAST, TOO_FAST_S, TOO_FAST_ANGLE, TOO_FAST_COUNTS = 1.2, 1.0, 0.3, 1.5
-# Below this time between lines (s), a board may repeat each count of a coarse encoder (rad) for as
-# long as its times and the speed keep step: a sound wheel then looks up to twice as fast.
-REPEATS_S, COARSE_ANGLE = 0.009, math.tau / 200
+COARSE_ANGLE = math.tau / 200  # of an encoder count that a board may report twice for seconds
 PACE_S = 1.5  # faster or slower by `AGREEMENT`, until this is a warning: 2 s with the smoothing
 ROUNDING = 0.006  # rad/s, of a reported speed
 JITTER_S = 0.004  # of the times of lines
@@ -104,7 +102,6 @@ class Block(NamedTuple):
     line: Motors  # the angles of the last line
     speeds: Motors  # in it
     unit: Rad  # of an encoder count
-    repeats: bool  # a count may be in two lines
     limit: Rad  # evidence of a fault
     patience: Seconds  # without an approach
     rest: Seconds  # without motion or a command, after which a wheel rests
@@ -169,7 +166,9 @@ class Wheels(Struct):
     # Commanded speeds; the caller sets these three. None: the emergency stop may cut the power.
     commanded: WheelSpeeds | None = STILL
     late: bool = False  # this computer was late, so the board may have stopped the motors
-    steps: Motors = NOTHING  # of the speeds in a line without the board's counts, by one count
+    # Lines come so soon that a board may report each count of a coarse encoder twice, as long as its
+    # times and the speed keep step: a sound wheel then looks up to twice as fast.
+    repeats: bool = False
     begins: bool = True  # the expected speeds begin at the measured ones
     angles: Motors = NOTHING  # of the block, rad
     turn: Rad = 0.0  # of the block by a gyro
@@ -296,9 +295,7 @@ class Wheels(Struct):
             angles, line = times(angles, share), times(line, share)
         limit, patience = max(FAULT_ANGLE, FAULT_COUNTS * count), FAULT_RESPONSES * lag
         rest = REST_S + 2 * count * kinematics.radius / LEAST_SPEED
-        each = self.seconds / self.lines
-        repeats = each < REPEATS_S and max(self.steps) * each > COARSE_ANGLE
-        block = Block(s, angles, line, speeds, count, repeats, limit, patience, rest)
+        block = Block(s, angles, line, speeds, count, limit, patience, rest)
         if commanded is None:
             self._drop()
             for wheel, angle in zip(self.wheels, angles, strict=True):
@@ -318,7 +315,7 @@ class Wheels(Struct):
         self._compare(block, kinematics)
 
     def _obey(self, block: Block, due: tuple[Rad, Rad]) -> None:
-        s, angles, _, speeds, _, _, limit, patience, _ = block
+        s, angles, _, speeds, _, limit, patience, _ = block
         fastest = 0.0
         for i, wheel in enumerate(self.wheels):
             k, angle = SIDE_OF[i], angles[i]
@@ -362,7 +359,7 @@ class Wheels(Struct):
         turns, most = abs(wheel.speed), TOO_FAST * peak
         rolled = wheel.fast_angle + angle
         beyond = abs(rolled) - most * s
-        if beyond <= 0.0 or wheel.approaches or block.repeats or not peak:
+        if beyond <= 0.0 or wheel.approaches or self.repeats or not peak:
             wheel.fast_s = wheel.fast_angle = 0.0
         else:
             wheel.fast_angle = math.copysign(beyond, rolled)
