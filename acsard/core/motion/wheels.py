@@ -166,7 +166,7 @@ class Wheels(Struct):
     # Commanded speeds; the caller sets these three. None: the emergency stop may cut the power.
     commanded: WheelSpeeds | None = STILL
     late: bool = False  # this computer was late, so the board may have stopped the motors
-    # Lines come so soon that a board may report each count of a coarse encoder twice, as long as its
+    # Lines come so soon that a board may report each count of a coarse encoder twice, while its
     # times and the speed keep step: a sound wheel then looks up to twice as fast.
     repeats: bool = False
     begins: bool = True  # the expected speeds begin at the measured ones
