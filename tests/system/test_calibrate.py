@@ -380,6 +380,7 @@ def test_poses_that_are_missing_or_of_another_type_are_reported(
             until(came, 5.0, "a sample")
 
 
+@pytest.mark.slow
 def test_calibrate_moves_no_real_robot_without_a_person(tmp_path: Path, peer: Peer) -> None:
     with running(tmp_path, port=peer.path) as (daemon, _):
         for words, why in ((["--yes"], "this robot is real"), ([], "terminal")):

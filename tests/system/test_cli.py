@@ -187,6 +187,7 @@ def test_a_failure_keeps_its_exit_code_when_the_reader_of_the_output_has_left(
     assert "Traceback" not in get.stderr
 
 
+@pytest.mark.slow
 def test_a_replay_fails_if_the_reader_of_its_output_has_left(tmp_path: Path) -> None:
     env = {key: value for key, value in environment().items() if key != "PYTHONUNBUFFERED"}
     tape, path = Tape(), tmp_path / "drive.rec.zst"
@@ -316,6 +317,7 @@ def test_a_simulator_does_not_remove_the_link_of_the_one_that_replaced_it(tmp_pa
 # move
 
 
+@pytest.mark.slow
 def test_move_drives_the_ways_one_after_the_other_and_prints_the_pose(
     shared: Daemon, bus: Bus
 ) -> None:

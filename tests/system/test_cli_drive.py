@@ -52,6 +52,7 @@ def driving(
         yield terminal, program
 
 
+@pytest.mark.slow
 @pytest.mark.variations(2)
 @pytest.mark.parametrize("columns", [40, 80])
 def test_drive_shows_reason_pose_and_help_on_a_screen_of_any_width(
@@ -198,6 +199,7 @@ def test_drive_at_a_terminal_without_a_screen_ends_with_2(shared: Daemon) -> Non
     assert "TERM" in program.stderr
 
 
+@pytest.mark.slow
 def test_a_drive_ends_with_zeros_although_its_terminal_reads_nothing(shared: Daemon) -> None:
     terminal, other = pty.openpty()
     fcntl.ioctl(other, termios.TIOCSWINSZ, struct.pack("HHHH", 50, 250, 0, 0))

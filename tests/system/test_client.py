@@ -468,6 +468,7 @@ def test_no_client_request_raised_an_exception_in_the_daemon(shared: Daemon) -> 
     assert shared.process.poll() is None
 
 
+@pytest.mark.slow
 @each("use", ["robot.messages('odom')", "robot.send(0.3)"])
 def test_a_program_that_never_closes_its_connection_ends(
     shared: Daemon, tmp_path: Path, use: str

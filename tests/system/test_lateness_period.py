@@ -62,6 +62,7 @@ def is_even(periods: Periods, waited: float, up: bool) -> None:
     assert periods.are_all_accounted_for() or not up
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "length",
     [
