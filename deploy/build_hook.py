@@ -5,11 +5,8 @@ hatchling runs this file when it builds.
 """
 
 import importlib.util
-import shutil
-import subprocess
 import sys
 import tempfile
-from importlib import metadata
 from pathlib import Path
 from typing import Any
 
@@ -41,16 +38,8 @@ class CustomBuildHook(BuildHookInterface):
             build_data["sbom_files"].append(str(made))
             # Only the environment of a release has zensical, which is ten times as large as acsard.
             if importlib.util.find_spec("zensical"):
-                build_data["force_include"][str(self.manual())] = "acsard/manual"
+                from deploy.manual import build
 
-    def manual(self) -> Path:
-        """Build the manual in the temporary directory, and return the directory of its site."""
-        work = Path(self.made.name, "manual")
-        sources = Path(self.root, "deploy/manual")
-        shutil.copytree(sources, work, ignore=shutil.ignore_patterns("site", ".cache"))
-        program = [sys.executable, "-m", "zensical", "build", "--strict", "-f", "mkdocs.yml"]
-        subprocess.run(program, cwd=work, check=True)
-        licence = metadata.distribution("zensical").read_text("licenses/LICENSE.md")
-        assert licence is not None
-        (work / "site/assets/LICENSE").write_text(licence)
-        return work / "site"
+                made = Path(self.made.name, "manual.zip")
+                build.build(made)
+                build_data["force_include"][str(made)] = "acsard/manual.zip"
