@@ -1,7 +1,7 @@
 """The table of all keys below `acsard/<id>/`: direction, type, rate, meaning and required roles.
 
 A key that is not in it does not exist: the bus declares its keys, and `permissions.py` derives the
-roles' permissions from it. `acsard topics`, the README and the reply to `topics` show it.
+roles' permissions from it. `acsard topics`, the manual and the reply to `topics` show it.
 """
 
 from __future__ import annotations
