@@ -286,12 +286,6 @@ def test_the_verdict_about_a_native_payload(key: str, payload: bytes, reason: ob
 # Services.
 
 
-@each("verb", ["stop", "deactivate", "reset_odometry"])
-@each("payload", [b"", b"{}", b"\xff garbage"])
-def test_a_service_without_arguments_ignores_its_payload(verb: Any, payload: bytes) -> None:
-    assert Receiver.request(verb, 7, "", payload) == Request(verb, 7)
-
-
 NUMBERS = [1_800_000_000_123, 7]
 TOO_MANY = b'{"numbers": [' + b"1, " * 64 + b"1]}"
 

@@ -113,13 +113,6 @@ class WithOdometry(World):
             self.now += pause
 
 
-def test_a_move_without_odometry_ends_before_it_began() -> None:
-    world = WithOdometry(0.0)
-    with pytest.raises(NoAnswerError, match="no odometry arrives"):
-        world.move()
-    assert world.sent == []
-
-
 def test_a_move_stops_when_the_odometry_falls_silent() -> None:
     world = WithOdometry(1.0)
     with pytest.raises(NoAnswerError, match="no odometry arrives"):

@@ -155,11 +155,6 @@ def test_an_export_that_fails_leaves_nothing_and_a_replaced_file_stays(
     assert (tmp_path / "old").read_text() == "mine"
 
 
-def test_calibration_refuses_a_recording_without_a_gyro(path: Path) -> None:
-    with pytest.raises(RecordingError, match="no gyro"):
-        calibration_csv(Recording([path]))
-
-
 GYRO = replace(Config(), odometry=replace(Config().odometry, gyro=True))
 
 

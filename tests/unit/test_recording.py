@@ -124,17 +124,6 @@ def test_a_changed_setting_is_in_the_next_head_after_20_s(bench: Bench) -> None:
     assert "linear_speed = 0.25" not in first.config
 
 
-def test_a_kill_costs_what_was_not_written(bench: Bench) -> None:
-    """Nothing is written at the end of a file that a reader needs."""
-    bench.drive(3)
-    count = bench.world.steps
-    bench.world.hold(0.5, seconds=0.9)
-    (path,) = listed(bench.where)
-    copy = bench.where / "copy"
-    copy.write_bytes(path.read_bytes())
-    assert played([copy]).comparison.steps == count
-
-
 @pytest.mark.parametrize("hours", [1, -1])
 def test_a_set_clock_begins_a_new_file_which_is_found_by_its_time(hours: int, bench: Bench) -> None:
     bench.drive(2)

@@ -69,25 +69,6 @@ def test_the_group_or_every_user_may_read_a_recording(
     assert modes(tmp_path / "b") == wanted
 
 
-@pytest.mark.skipif(os.geteuid() != 0, reason="gives a directory away")
-def test_recording_works_in_a_directory_of_another_user(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("ACSARD_RECORD", ".")
-    monkeypatch.setattr(directory, "PRIVATE_STATE", tmp_path)
-    monkeypatch.chdir(tmp_path)
-    tmp_path.chmod(0o777)
-    child = os.fork()
-    if child == 0:
-        try:
-            os.setresuid(65534, 65534, 65534)
-            record(new(Path()))
-        finally:
-            os._exit(0)
-    os.waitpid(child, 0)
-    assert modes(tmp_path) == ["777", "644"]
-
-
 class Disk(NamedTuple):
     f_blocks: int
     f_bavail: int

@@ -8,14 +8,12 @@ from functools import lru_cache
 from pathlib import Path
 
 import pytest
-from msgspec.structs import replace
 
 from acsard.cli import main
-from acsard.core.config.settings import Config
 from acsard.recording.file import Recording
 from acsard.recording.recorded_steps import US_PER_S
 from tests.each import each
-from tests.scenarios.taped import Tape, recorded_world
+from tests.scenarios.taped import Tape
 from tests.scenarios.world import START, World
 from tests.system.typed import typed
 from tests.unit.test_checkup_verb import on_terminal
@@ -99,37 +97,6 @@ def test_another_configuration_computes_the_odometry_again(where: Path, here: Pa
 
 
 # calibrate
-
-
-def spin_and_curve(world: World) -> None:
-    """Drive the motions that a calibration needs: rest, straight and back, turns to both sides."""
-    world.run(3.0)
-    for linear, angular, seconds in (
-        (0.5, 0.0, 5.0), (-0.5, 0.0, 5.0), (0.0, 1.5, 8.0), (0.0, -1.5, 8.0),
-        (0.0, 0.7, 8.0), (0.0, -0.7, 8.0), (0.4, 0.8, 8.0), (0.4, -0.8, 8.0),
-    ):  # fmt: skip
-        world.drive(linear, angular, seconds)
-        world.run(1.0)
-
-
-@pytest.mark.slow
-def test_calibrate_takes_a_recording_of_a_robot_with_a_gyro_as_it_is(
-    here: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    wide = replace(Config().drive, wheel_separation_multiplier=1.1)
-    config = replace(Config(), drive=wide, odometry=replace(Config().odometry, gyro=True))
-    tape, world = recorded_world(config)
-    spin_and_curve(world)
-    # calibrate recognizes the format by its content, not by its name
-    tape.save(here / "drive.log", config)
-    (here / "acsard.toml").write_text("")
-    assert main(["calibrate", "log", "drive.log", "--json"]) == 0
-    by_recording = capsys.readouterr().out
-    assert main(["recording", "export", "drive.log", "drive.csv", "--csv"]) == 0
-    capsys.readouterr()
-    assert main(["calibrate", "log", "drive.csv", "--json"]) == 0
-    by_table = capsys.readouterr().out.replace("drive.csv", "drive.log")
-    assert by_recording.partition('"notes"')[0] == by_table.partition('"notes"')[0]
 
 
 @each("words", ["y.pdf", "y.csv", "y.mcap --csv", "y.mcap --rosbag2"])

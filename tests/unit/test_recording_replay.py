@@ -43,25 +43,6 @@ def test_a_replay_goes_on_after_damage_at_the_next_state(tmp_path: Path) -> None
     assert len(recording.damage) == 1
 
 
-def test_a_missing_file_is_a_gap_and_another_run_is_none(tmp_path: Path) -> None:
-    paths = TAPE.save(tmp_path / "1", end=200), TAPE.save(tmp_path / "2", first=400)
-    _, playback, _ = played(*paths)
-    assert [gap.steps for gap in playback.gaps] == [200]
-    with (tmp_path / "3").open("wb") as file:
-        FrameWriter(file).begin(Head("0.2.0", "acsar", 0, 0, 0, "", b"", started_ns=7))
-    _, playback, _ = played(TAPE.save(tmp_path / "1", end=200), tmp_path / "3")
-    assert playback.gaps == []
-
-
-def test_another_configuration_changes_the_lines(tmp_path: Path) -> None:
-    config = CONFIG
-    slow = replace(config, limits=replace(config.limits, linear_speed=0.2))
-    for first in (0, 400):
-        _, playback, _ = played(TAPE.save(tmp_path / "a", first=first), other=slow)
-        assert "line" in playback.comparison.first_by_output
-        assert playback.robot.config == slow
-
-
 def test_steps_outside_the_time_are_told_apart(tmp_path: Path) -> None:
     path = TAPE.save(tmp_path / "a")
     times = TAPE.taken[450].now.wall_ns, TAPE.taken[460].now.wall_ns

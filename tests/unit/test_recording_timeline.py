@@ -1,12 +1,11 @@
 """The timeline of a recording, and the messages that its replayed robot publishes.
 
-`scenarios/test_export.py` proves that they equal the original messages.
+`words/transcripts/timeline.txt` shows what `acsard recording show` prints of a whole day, and
+`scenarios/test_export.py` proves that the messages equal the original ones.
 """
 
 from __future__ import annotations
 
-import tempfile
-from functools import cache
 from pathlib import Path
 
 from acsard.core.config.parsing import effective
@@ -17,9 +16,8 @@ from acsard.core.values import NS_PER_S
 from acsard.recording.file import Failure, FrameWriter, Head, ReadRecord, Recording, Waits
 from acsard.recording.published import Published, published
 from acsard.recording.timeline import Timeline, TimelineEntry
-from tests.scenarios.taped import Tape, recorded_world
 from tests.scenarios.world import START
-from tests.unit.drives import CONFIG, drive
+from tests.unit.drives import drive
 
 
 def head(number: int = 0, started_ns: int = 0) -> Head:
@@ -31,62 +29,8 @@ def entries_of(*records: ReadRecord) -> list[TimelineEntry]:
     return [entry for record in records for entry in timeline.take(record)]
 
 
-def story(tape: Tape, without: range = range(0)) -> list[TimelineEntry]:
-    return entries_of(head(), *[step for step in tape.steps() if step.number not in without])
-
-
 def texts(entries: list[TimelineEntry], name: str) -> list[str]:
     return [entry.sentence for entry in entries if entry.name == name]
-
-
-def test_each_event_has_an_entry_with_its_time_its_level_and_its_client() -> None:
-    tape = drive()
-    events = [(step.now.wall_ns, e) for step in tape.taken for e in step.news.events]
-    first, *entries = story(tape)
-    assert (first.name, first.wall_ns) == ("start", START.wall_ns)
-    assert first.text == "the daemon starts (acsard 0.2.0)"
-    assert entries == [
-        TimelineEntry(wall_ns, event.name, event.text, event.level, event.by)
-        for wall_ns, event in events
-    ]
-    (stop,) = texts(entries, "stop")
-    assert stop.endswith("(by unnamed (native))")
-
-
-def test_missing_steps_are_reported() -> None:
-    (gap,) = [entry for entry in story(drive(), range(100, 200)) if entry.name == "gap"]
-    assert gap.text.startswith("100 steps are missing before this step (")
-    assert gap.level == "warning"
-
-
-def test_a_recording_that_continues_another_begins_with_what_the_robot_does() -> None:
-    steps = drive().steps()
-    entry, *others = entries_of(head(150), *steps[150:])
-    assert entry.name == "continues"
-    assert entry.wall_ns == steps[150].now.wall_ns
-    assert entry.sentence == "the robot is driving (commanded by app), link up (by app)"
-    assert "continues" not in {other.name for other in others}
-
-
-def test_a_clock_that_is_set_and_a_suspended_computer_are_reported() -> None:
-    tape, world = recorded_world()
-    world.run(0.5)
-    world.wall_offset_ns += 10 * 3600 * 10**9
-    world.run(0.5)
-    world.wall_offset_ns -= 60 * 10**9
-    world.run(0.5)
-    forward, back = texts(story(tape), "clock")
-    assert "was set forward by 10 h, or the computer was suspended: " in forward
-    assert "was set back by 1 min: " in back
-
-
-def test_a_run_that_ends_without_a_shutdown_is_reported_before_the_next_start() -> None:
-    steps = drive().steps()
-    entries = entries_of(head(), *steps, head(started_ns=1), *steps)
-    names = [entry.name for entry in entries]
-    cut = names.index("cut")
-    assert names[cut + 1] == "start"
-    assert entries[cut].wall_ns == steps[-1].now.wall_ns
 
 
 def test_a_failure_of_the_daemon_is_reported() -> None:
@@ -100,25 +44,6 @@ def test_a_failure_of_the_daemon_is_reported() -> None:
     assert first.wall_ns == now.wall_ns  # in the first step, too
 
 
-def stopped_by_neutral_first() -> Tape:
-    """Return a drive that is stopped, and whose sender then sends speeds without a zero."""
-    tape, world = recorded_world()
-    world.drive(0.5, seconds=1.0)
-    world.call("stop")
-    world.run(1.0)
-    world.call("clear")
-    world.run(0.3)
-    world.hold(0.5, seconds=2.5)
-    world.run(1.0)
-    return tape
-
-
-def test_a_new_reason_of_the_same_mode_has_an_entry_with_its_source() -> None:
-    first, *_ = texts(story(stopped_by_neutral_first()), "reason")
-    assert first.startswith("ready: send a zero first: app must send a zero ")
-    assert first.endswith("(by app)")
-
-
 def test_a_source_that_waits_has_an_entry_once_in_a_drive() -> None:
     steps = drive().steps()
     waits = Waits(steps[100].now, {"nav": ("source_priority", "app has priority")})
@@ -130,17 +55,6 @@ def test_a_source_that_waits_has_an_entry_once_in_a_drive() -> None:
 
 
 # the messages
-
-
-@cache
-def messages(config: Config = CONFIG) -> list[Published]:
-    """Return the messages of the drive by a robot with this configuration."""
-    with tempfile.TemporaryDirectory() as place:
-        return list(published(Recording([drive().save(Path(place) / "a.rec.zst")]), config))
-
-
-def names(published: list[Published]) -> set[str]:
-    return {message.channel.name for message in published}
 
 
 def logs(messages: list[Published]) -> list[Log]:

@@ -62,8 +62,3 @@ def test_an_end_follows_its_begin(begin: str, end: str, begin_ns: int, end_ns: i
 def test_a_wrong_time_is_refused_with_examples(text: str) -> None:
     with pytest.raises(TimeError, match=r"write for example 14:05|counts from --from"):
         time_range(text, None, NOW)
-
-
-def test_an_end_before_its_begin_is_refused() -> None:
-    with pytest.raises(TimeError, match="--to is 2026-11-21 00:00:00, not after --from"):
-        time_range("today", "2026-11-20", NOW)

@@ -82,20 +82,6 @@ def test_the_list_has_a_row_for_each_recording_of_the_range(where: Path) -> None
     assert out == f"no recordings in {where} in that time: leave out --from and --to to list all"
 
 
-def test_the_list_names_the_file_that_is_being_recorded_and_one_that_is_none(
-    tmp_path: Path,
-) -> None:
-    tape = Tape()
-    World(recorder=tape).run(0.3)
-    tape.save(tmp_path / name(1))
-    (tmp_path / name(2)).write_bytes(bytes(1000))
-    code, out, err = log(tmp_path)
-    assert (code, err) == (0, "")
-    first, other = out.splitlines()
-    assert first.endswith("[being recorded]")
-    assert other.endswith("the beginning cannot be read")
-
-
 def test_the_newest_recording_or_all_of_a_range_are_shown(where: Path) -> None:
     code, out, err = log(where, "show", "--json")
     assert code == 0
@@ -110,15 +96,6 @@ def test_the_newest_recording_or_all_of_a_range_are_shown(where: Path) -> None:
     assert "gap" not in {one for _, one in found}
     _, whole, _ = log(where, "show", "--json", "--from", "2000-01-01")
     assert [entry for entry in entries(whole) if entry[0] >= found[1][0]] == found[1:]
-
-
-@pytest.mark.parametrize("verb", ENDINGS)
-def test_a_time_without_a_recording_is_refused(verb: str, where: Path, tmp_path: Path) -> None:
-    new = [str(where / name(1)), str(tmp_path / "new")] if ENDINGS[verb] else []
-    code, out, err = log(where, verb, *new, "--from", "2000-01-01", "--to", "2000-01-02")
-    assert (code, out) == (1, "")
-    assert "correct --from and --to" in err
-    assert not [*tmp_path.iterdir()]
 
 
 def test_a_file_that_is_no_recording_does_not_hide_the_others(where: Path, tmp_path: Path) -> None:

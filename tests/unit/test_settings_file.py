@@ -93,15 +93,6 @@ def test_a_missing_file_is_created_only_if_the_caller_permits_it(tmp_path: Path)
     assert os.listdir(tmp_path) == ["acsard.toml"]
 
 
-def test_new_values_may_be_calculated_from_the_present_ones_and_line_ends_stay(
-    tmp_path: Path,
-) -> None:
-    file = tmp_path / "acsard.toml"
-    file.write_bytes(b"\xef\xbb\xbf# mine\r\n[mcu]\r\nencoder_counts = 5\r\n")
-    change(file, lambda config: {"mcu.encoder_counts": 2 * config.mcu.encoder_counts})
-    assert file.read_bytes() == b"# mine\r\n[mcu]\r\nencoder_counts = 10\r\n"
-
-
 def start_with(file: Path) -> None:
     parse(find(str(file))[1])
 

@@ -8,8 +8,6 @@ from itertools import pairwise
 from operator import methodcaller
 from typing import Any
 
-import pytest
-
 from acsard.core.config.named_faults import ARGUMENTS, FAULTS, named
 from acsard.core.config.settings import Config, SimConfig
 from acsard.core.simulator.fake_mcu import MS, RESET_NS, FakeMcu
@@ -17,9 +15,7 @@ from acsard.core.simulator.faults import Faults
 from tests.each import each
 from tests.unit.test_simulator import (
     LINE,
-    LINE_NS,
     SPEEDS,
-    STILL,
     TRUE,
     ZERO,
     Heard,
@@ -88,32 +84,6 @@ def test_a_fault_of_the_report_does_not_change_the_motion(
     assert [data for _, data in chunks[-1:]] == ([] if reply is None else [reply])
     assert mcu.vehicle.set_points == SPEEDS
     assert mcu.valid_lines == 6
-
-
-@pytest.mark.parametrize(
-    ("fault", "fed", "drives_s"), [("no_watchdog", b"", 60), ("watchdog_fed_by_bad_lines", b"x", 0)]
-)
-def test_a_faulty_watchdog_lets_the_motors_run_on(fault: str, fed: bytes, drives_s: int) -> None:
-    mcu = FakeMcu(TRUE)
-    with getattr(mcu, fault)():
-        mcu.receive(0, LINE)
-        for n in range(1, 10):
-            mcu.receive(n * 100 * MS, fed and b"x\r\n")
-            mcu.advance((n * 100 + 50) * MS)
-            assert mcu.vehicle.set_points == SPEEDS
-        mcu.advance(60_000 * MS)
-        assert any(mcu.vehicle.set_points) is bool(drives_s)
-
-
-def test_a_slow_board_acts_and_answers_later_by_its_delay() -> None:
-    (prompt,) = drive(FakeMcu(TRUE), 0, 1)
-    mcu = FakeMcu(TRUE)
-    with mcu.slow_reply(0.03):
-        mcu.receive(0, LINE)
-        mcu.advance(LINE_NS + 31 * MS)
-        assert mcu.vehicle.set_points == STILL
-        ((late, _),) = replies(mcu, 100 * MS)
-    assert late == prompt[0] + 30 * MS
 
 
 @each(
