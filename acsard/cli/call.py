@@ -21,7 +21,7 @@ from acsard.host.errors import UsageError
 # The service `set` is `acsard set`.
 CALLABLE_SERVICES = tuple(service for service in SERVICES if service != "set")
 
-RELEASES = tuple(service for service, row in SERVICES.items() if row.optional)
+RELEASES = tuple(service for service, row in SERVICES.items() if row.payload == "Release")
 
 
 class _Known(tuple[str, ...]):

@@ -14,11 +14,11 @@ from acsard.checkup import procedure
 from acsard.checkup.board import Wire
 from acsard.checkup.checkup_report import changes, report, summary, withheld
 from acsard.checkup.findings import Finding
+from acsard.cli.borrowed_port import BorrowedPort
 from acsard.cli.common import add_config, add_outcome, add_port, load
 from acsard.core.config.settings import SIMULATOR, Config
 from acsard.core.simulator.fake_mcu import FakeMcu
 from acsard.core.simulator.virtual_wire import VirtualWire
-from acsard.daemon.serial.blocking import BlockingPort
 from acsard.host import clock
 from acsard.host.config_file import change, writable
 from acsard.host.errors import Exit, MendableError, UsageError
@@ -31,15 +31,17 @@ Test the microcontroller on your own robot with its wheels lifted. The tool find
 the board and tests everything that the robot's safety depends on: baud rate, dialect and trailing
 comma, reply rate and round trip, the checked link, each motor and encoder alone, the watchdog,
 damaged lines, and the emergency stop and the bumpers that the board reports. The tool opens the
-port itself, so stop the daemon first (exit code 75 if the daemon has the port). It asks you to type
-that the wheels are lifted. Then it turns the motors one by one, and then all together. It commands
-at most 3 rad/s, but a wheel whose encoder is dead or reversed can reach full speed. If the board
-restarts during a test, the tool reports that and repeats the test. The check ends if the tool
-itself could not run for more than 3 s (5 s before the first motor test), for example because the
-computer was suspended. The tool always ends by sending zero speeds to the board, and sends nothing
-more after them. The exit code is 0 if every test was judged and none failed. It is 1 if a test
-failed, if the tool ended early, or if this computer was too slow to judge a test; in that case try
-again when the computer is idle.
+port itself. If a daemon on this computer has the port open, and its robot rests, the daemon
+switches the robot off and lends the port until the check ends; it must answer at the address in
+the configuration, and this user must be an operator or more. Otherwise the exit code is 75. The
+tool asks you to type that the wheels are lifted. Then it turns the motors one by one, and then all
+together. It commands at most 3 rad/s, but a wheel whose encoder is dead or reversed can reach full
+speed. If the board restarts during a test, the tool reports that and repeats the test. The check
+ends if the tool itself could not run for more than 3 s (5 s before the first motor test), for
+example because the computer was suspended. The tool always ends by sending zero speeds to the
+board, and sends nothing more after them. The exit code is 0 if every test was judged and none
+failed. It is 1 if a test failed, if the tool ended early, or if this computer was too slow to judge
+a test; in that case try again when the computer is idle.
 """
 
 
@@ -103,7 +105,7 @@ def _checked(
             ),
             single_key_mode() if isinstance(prompt, TerminalPrompt) else nullcontext(),
         ):
-            procedure.run(_wire(config), prompt, config, report_finding, clock.asleep_ns)
+            procedure.run(_wire(config, prompt), prompt, config, report_finding, clock.asleep_ns)
     except MendableError as error:
         if not args.json:
             raise
@@ -155,7 +157,7 @@ def _prompt(args: argparse.Namespace, port: str) -> Prompt:
     return Prompt(args.json)
 
 
-def _wire(config: Config) -> Wire:
+def _wire(config: Config, prompt: Prompt) -> Wire:
     if config.mcu.port == SIMULATOR:
         return VirtualWire(FakeMcu(config))
-    return BlockingPort(config.mcu.port)
+    return BorrowedPort(config, prompt.show_text)

@@ -107,6 +107,7 @@ class Robot:
             kind, why = f"start -> {self._life.mode}", self._life.why
             first = Event("mode", why.text, "warning", kind=kind, code=why.code)
             self._announced = (first,)
+        self.port_released = False  # another program may use the serial port
         self._choice = Choice()
         self._last = LastLine(made_of=(None, self._life.mode))
         # Motion, twist, limits and cap with which the motion does not change; its wheel speeds.
@@ -520,10 +521,13 @@ class Robot:
                     self._arbiter.require_neutral(asked_ns)
                 return message, numbers
             case "activate":
+                self.port_released = False  # even if it is refused
                 numbers = life.activate(request.numbers, asked_ns)
                 self._arbiter.forget_clocks()
                 self._arbiter.require_neutral(asked_ns)
                 return "active", numbers
+            case "deactivate" if request.release_port:
+                return self._release_port(request.by, now)
             case "deactivate":
                 message = life.deactivate(request.by, now)
                 return message, (life.latches.last,)
@@ -534,6 +538,24 @@ class Robot:
                 return describe_changes(changes) or NOTHING_CHANGED, ()
             case _:
                 assert_never(request.verb)
+
+    def _release_port(self, by: str, now: Instant) -> tuple[str, tuple[int, ...]]:
+        if self.config.mcu.simulated:
+            raise RefusedError("the built-in simulator has no serial port")
+        if self._life.shutting_down or not self._at_rest:
+            raise RefusedError("the port is released only while the robot rests")
+        numbers: tuple[int, ...] = ()
+        if self._life.mode not in (Mode.STOPPED, Mode.FAULT, Mode.INACTIVE):
+            self._life.deactivate(by, now)
+            numbers = (self._life.latches.last,)
+        self.port_released = True
+        return "the serial port is closed; call srv/activate to open it again", numbers
+
+    @property
+    def _at_rest(self) -> bool:
+        # Two lines are zero: the last one that left, which the wheels follow, and the last one that
+        # was computed.
+        return self.speeds == STILL and self._last.motion.twist == REST
 
     def _error_model(self) -> ErrorModel:
         config = self.config
@@ -552,11 +574,9 @@ class Robot:
         return f"pose is x {pose.x:g}, y {pose.y:g}, yaw {pose.yaw:g}"
 
     def _set(self, settings: dict[str, Plain], now_ns: Ns) -> Changes:
-        # The robot is at rest only if two lines are zero: the last one that left, which the wheels
-        # follow, and the last one that was computed.
-        before, at_rest = self.config, self.speeds == STILL and self._last.motion.twist == REST
+        before = self.config
         try:
-            self.config, changes = changed(before, settings, at_rest)
+            self.config, changes = changed(before, settings, self._at_rest)
         except ConfigError as error:
             raise RefusedError(str(error)) from None
         self._errors = self._error_model()

@@ -173,6 +173,7 @@ class Request(Struct, frozen=True, omit_defaults=True):
     settings: dict[str, Plain] = {}  # of the verb `set`, by dotted key
     # Of the causes that `clear` or `activate` releases, if the client names them.
     numbers: tuple[int, ...] | None = None
+    release_port: bool = False  # of `deactivate`
 
 
 class Answer(Struct, frozen=True):

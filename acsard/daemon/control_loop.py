@@ -98,6 +98,8 @@ class ControlLoop:
             if period is not NO_PERIOD:
                 tick = pace.period_ended(heard.missed)
             news = robot.hear(now, heard)
+            if heard.requests:
+                port.release(robot.port_released)
             # The latches do not change without news.
             if news is not QUIET and robot.latches is not keeper.latches:
                 keeper.keep(robot.latches)

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import pytest
 
-from tests.scenarios.world import World
+from acsard.core.config.settings import Config, McuConfig
+from tests.each import each
+from tests.scenarios.world import World, naming
 
 
 @pytest.fixture
@@ -54,6 +56,38 @@ def test_a_deactivated_robot_ramps_down_and_ignores_commands(world: World) -> No
     world.hold(0.5, seconds=1.0)
     assert world.state.mode == "inactive"
     assert world.state.linear == 0.0
+
+
+RELEASE = b'{"release_port": true}'
+
+
+def test_the_port_is_released_at_rest_until_the_next_activate() -> None:
+    world = World(Config(mcu=McuConfig(port="/dev/ttyACM0")))
+    world.drive(0.5, seconds=0.5)
+    refused = world.call("deactivate", RELEASE)
+    assert (refused.success, world.port.released) == (False, False)
+    assert "while the robot rests" in refused.message
+    world.hold(0.0, seconds=2.0)
+    assert world.call("deactivate", RELEASE).success
+    assert (world.state.mode, world.port.released) == ("inactive", True)
+    assert world.call("activate").success
+    assert (world.state.mode, world.port.released) == ("ready", False)
+
+
+@each("before", ["stop", "deactivate"])
+def test_the_port_of_a_robot_that_was_off_is_released_and_the_robot_stays_off(before: str) -> None:
+    world = World(Config(mcu=McuConfig(port="/dev/ttyACM0")))
+    world.run(1.0)
+    world.call(before)
+    world.run(1.0)
+    mode, reply = world.state.mode, world.call("deactivate", RELEASE)
+    assert (reply.success, reply.data.numbers, world.port.released) == (True, [], True)
+    assert not world.call("activate", naming([])).success
+    assert (world.state.mode, world.port.released) == (mode, False)
+
+
+def test_the_simulator_built_in_has_no_port_to_release(world: World) -> None:
+    assert not world.call("deactivate", RELEASE).success
 
 
 def test_a_robot_stopped_while_inactive_is_inactive_after_clear(world: World) -> None:

@@ -72,6 +72,7 @@ class VirtualPort:
         self.takes: int | None = None
         """Number of bytes of the next line that the kernel takes; None for all."""
         self.trouble = ""
+        self.released = False
         self.sent: deque[tuple[int, bytes]] = deque(maxlen=100_000)
         self.mcu: FakeMcu | None = None
         self._opening = (baud_rate, stop, period_ns)
@@ -97,6 +98,9 @@ class VirtualPort:
         batch = tuple(self._received)
         self._received.clear()
         return batch
+
+    def release(self, released: bool) -> None:
+        self.released = released
 
     def offer(self, line: bytes, now: Instant) -> Offered:
         if self.mcu is None:

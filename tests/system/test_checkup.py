@@ -45,6 +45,26 @@ def test_a_port_that_the_daemon_holds_ends_with_75_and_how_to_stop_it(
     bus.comes_to("ready")
 
 
+@pytest.mark.slow
+def test_a_running_daemon_lends_its_port_and_gets_it_back(tmp_path: Path) -> None:
+    """The board is silent, so that the check ends soon."""
+    with Program(acsard("sim", "--link", "mcu", "--fault", "mute"), tmp_path) as sim:
+        sim.says("acsard run --port")
+        port = tmp_path / "mcu"
+        with Daemon(tmp_path, port) as daemon, Bus(daemon.endpoint) as bus:
+            ended = typed("mcu", "check", "--config", str(daemon.config), "--yes")
+            assert "FAIL    baud rate              nothing received" in ended.out
+            assert "lends the port for this check" in ended.err
+            assert "the daemon has the port again" in ended.err
+            assert bus.comes_to("waiting")
+            until(lambda: len(daemon.events("port_open")) == 2, 5.0, "the port is open again")
+            bus.get("srv/stop")
+            ended = typed("mcu", "check", "--config", str(daemon.config), "--yes")
+            assert ended.code == 1
+            assert bus.state()["mode"] == "stopped"
+            until(lambda: len(daemon.events("port_open")) == 3, 5.0, "the port is open again")
+
+
 def test_a_port_that_is_not_there_ends_with_66() -> None:
     ended = typed("mcu", "check", "--port", "/dev/acsar_none", "--yes")
     assert ended.code == 66

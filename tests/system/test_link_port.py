@@ -25,7 +25,7 @@ from acsard.core.link.checked_line import seal
 from acsard.core.link.link_setup import LinkSetup
 from acsard.core.link.session import McuSession
 from acsard.core.values import NS_PER_S, STILL, Event, Instant
-from acsard.daemon.serial.device import open_raw
+from acsard.daemon.serial.device import close, open_raw
 from acsard.daemon.serial.port import DRIVER_HUNG, SerialPort
 from acsard.host import clock
 from acsard.host.clock import SuspendDetector
@@ -250,6 +250,25 @@ async def test_a_port_whose_driver_accepts_no_bytes_is_reported_while_it_still_r
             while True:
                 os.read(line.board, 65536)
         assert not await blocked("up")
+
+
+async def test_a_released_port_is_closed_with_zeros_and_opened_again(line: Line) -> None:
+    async with line.port() as port:
+        keeper = asyncio.create_task(port.keep_open())
+        assert port.offer(STOP, clock.now()) == "sent"
+        port.release(True)
+        await asyncio.sleep(0.5)
+        assert (port.is_open, port.opened, port.offer(STOP, clock.now())) == (False, 1, "down")
+        assert "srv/activate" in port.trouble
+        other = open_raw(line.path, 115200)
+        port.release(False)
+        await asyncio.sleep(0.3)
+        assert not port.is_open, "the other program still has it"
+        close(other, wait_s=1.0)
+        other.close()
+        await asyncio.sleep(0.5)
+        assert (port.is_open, port.opened) == (True, 2)
+        keeper.cancel()
 
 
 async def test_a_device_that_opened_too_late_is_not_left_exclusive(

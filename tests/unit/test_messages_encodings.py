@@ -39,6 +39,7 @@ from acsard.core.messages.schema import (
     ServiceReply,
     SetPose,
     Settings,
+    SwitchOff,
     TFMessage,
     Time,
     Twist,
@@ -95,7 +96,7 @@ MESSAGES = [
     *(REPORT.current(key, lambda: SNAPSHOT) for key in ("odom", "tf", "state", "diagnostics")),
     ServiceReply(True, "done", ReplyData([7], {"rates.odom": Change(1.0, 2.0)})),
     TwistStamped(Header(Time(1, 2), "odom"), TWIST), JointState(name=["a"], velocity=[1.0]),
-    Release([7]), SetPose(1.0, 2.0, 3.0), Settings({"rates.odom": 5.0}),
+    Release([7]), SwitchOff(True), SetPose(1.0, 2.0, 3.0), Settings({"rates.odom": 5.0}),
 ]  # fmt: skip
 
 

@@ -104,8 +104,8 @@ def test_a_time_outside_the_range_of_ros_is_clamped(wall_s: int, sec: int) -> No
 # JSON Schemas
 
 INCOMING = {
-    "Twist", "TwistStampedIn", "JointStateIn", "ImuIn", "SetPose", "Release", "Settings",
-    "GatewayState", "SpeedLimit",
+    "Twist", "TwistStampedIn", "JointStateIn", "ImuIn", "SetPose", "Release", "SwitchOff",
+    "Settings", "GatewayState", "SpeedLimit",
 }  # fmt: skip
 
 
@@ -151,7 +151,7 @@ def test_the_incoming_and_outgoing_schemas_are_those_of_the_topic_table() -> Non
     for topic in TOPICS:
         types[topic.direction] |= {name for name in topic.type.split(" or ") if name in MESSAGES}
     out = types["out"] | types["service"] | types["query"] | {"Imu"}  # published by the simulator
-    inputs = types["in"] | {"SetPose", "Release", "Settings"}
+    inputs = types["in"] | {"SetPose", "Release", "SwitchOff", "Settings"}
     assert {name.removesuffix("In") for name in INCOMING} == inputs
     assert {name for name in INCOMING if name.endswith("In")} == {f"{n}In" for n in inputs & out}
     assert out | {"Config"} == set(SCHEMAS) - INCOMING
@@ -233,6 +233,8 @@ def is_accepted(name: str, value: object) -> bool:
     try:
         if name == "Release":
             Receiver.request("clear", 1, "application/json", payload)
+        elif name == "SwitchOff":
+            Receiver.request("deactivate", 1, "application/json", payload)
         elif key == "set_pose":
             Receiver.request("set_pose", 1, "application/json", payload)
         elif key == "imu":
@@ -275,6 +277,8 @@ def is_accepted(name: str, value: object) -> bool:
         ("Release", {"numbers": [-1]}, False),
         ("Release", {"numbers": [2**53]}, False),
         ("Release", {"number": 5}, False),
+        ("SwitchOff", {"release_port": True}, True),
+        ("SwitchOff", {"port": True}, False),
     ],
 )  # fmt: skip
 def test_the_schema_accepts_a_value_exactly_if_the_daemon_accepts_it(

@@ -28,6 +28,7 @@ from acsard.core.messages.schema import (
     Release,
     SetPose,
     Settings,
+    SwitchOff,
     Twist,
     TwistStamped,
     Vector3,
@@ -264,6 +265,8 @@ class Receiver:
                 return replace(request, settings=settings)
             case Release(numbers):
                 return replace(request, numbers=None if numbers is None else tuple(numbers))
+            case SwitchOff(release_port):
+                return replace(request, release_port=release_port)
             case SetPose(x, y, yaw):
                 if not all(map(math.isfinite, (x, y, yaw))) or max(abs(x), abs(y)) > 1e6:
                     raise DecodeError(

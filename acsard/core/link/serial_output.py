@@ -25,6 +25,9 @@ class Port(Protocol):
     def take(self, late: Instant | None = None) -> tuple[Received, ...]:
         """Return the bytes since the last call; in a `late` step, those in the kernel, too."""
 
+    def release(self, released: bool) -> None:
+        """Close the port, and keep it closed for another program, until False opens it again."""
+
     def offer(self, line: bytes, now: Instant) -> Offered:
         """Write a line (with its end) immediately or drop it. `now` is the step that made it."""
 

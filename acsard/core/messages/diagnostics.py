@@ -161,8 +161,8 @@ def _mode(status: Status) -> Row:
 
 def _check(config: Config) -> str:
     return (
-        "lift the wheels off the ground, stop the daemon, and type `acsard mcu check --port "
-        f"{config.mcu.port}`, which finds the cause"
+        f"lift the wheels off the ground, and type `acsard mcu check --port {config.mcu.port}` on "
+        "this robot's computer: it finds the cause, and the daemon lends it the port meanwhile"
     )
 
 

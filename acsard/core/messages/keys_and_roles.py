@@ -73,7 +73,11 @@ SERVICES: dict[Verb, Service] = {
         optional=True,
     ),
     "deactivate": Service(
-        "operator", "switch the robot off: it slows down to zero and ignores commands"
+        "operator",
+        "switch the robot off: it slows down to zero and ignores commands",
+        "SwitchOff",
+        '{"release_port": false}',
+        optional=True,
     ),
     "reset_odometry": Service("operator", "set the pose to x 0, y 0, yaw 0"),
     "set_pose": Service(

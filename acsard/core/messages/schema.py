@@ -604,6 +604,14 @@ class Release(Message, frozen=True):
     """
 
 
+class SwitchOff(Message, frozen=True):
+    """Payload of the service `deactivate`."""
+
+    release_port: bool = False
+    """Also close the serial port until the next `activate`, so that another program can use it. The
+    robot must rest. A robot that is stopped or in fault stays so, and only the port is closed."""
+
+
 class Settings(Message, frozen=True):
     """New values for settings, by the dotted keys of the settings in `acsard.toml`."""
 
@@ -700,6 +708,7 @@ MESSAGES: dict[str, type[Message]] = {
         ServiceReply,
         SetPose,
         Release,
+        SwitchOff,
         Settings,
         Info,
         Interfaces,

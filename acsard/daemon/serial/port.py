@@ -33,6 +33,8 @@ PERMISSION_TIMEOUT_S = 2.0  # for udev to grant access at the start
 
 DRIVER_HUNG = "the driver of the serial port did not answer"
 
+RELEASED = "the serial port is released to another program: call srv/activate to open it again"
+
 FINAL_STOP_TIMEOUT_S = 0.15  # twice a line at the lowest baud rate, plus a margin
 
 
@@ -62,7 +64,8 @@ class SerialPort(Port):
         self._received: list[Received] = []
         self._output = SerialOutput(baud_rate, stop, period_ns)
         self._device: serial.Serial | None = None  # while it is open
-        self._lost = asyncio.Event()
+        self._lost, self._ours = asyncio.Event(), asyncio.Event()
+        self._ours.set()  # the port is not released
         self._fd = -1
         # Devices that threads are opening: `st_dev`, `st_ino`.
         self._opening = set[tuple[int, int]]()
@@ -105,6 +108,17 @@ class SerialPort(Port):
         self.sent_ns = self._output.sent_ns
         return offered
 
+    def release(self, released: bool) -> None:
+        if released is not self._ours.is_set():
+            return
+        if not released:
+            self.trouble = ""
+            self._ours.set()
+            return
+        self._ours.clear()
+        self._leave(None)
+        self.trouble = RELEASED
+
     # Opening and reopening.
 
     async def __aenter__(self) -> SerialPort:
@@ -129,6 +143,7 @@ class SerialPort(Port):
             if self.is_open:
                 await self._lost.wait()
             for attempt in itertools.count():
+                await self._ours.wait()
                 try:
                     await self._open()
                     break
@@ -157,6 +172,10 @@ class SerialPort(Port):
             raise OSError(errno.EIO, str(error)) from None
         except TimeoutError:
             raise OSError(errno.EIO, DRIVER_HUNG) from None
+        if not self._ours.is_set():
+            close(device)
+            device.close()
+            raise OSError(errno.EBUSY, RELEASED)
         self._lost.clear()
         self._device, self._fd = device, device.fileno()
         self._output, self.sent_ns = SerialOutput(baud_rate, self._stop, self._period_ns), 0
@@ -168,6 +187,8 @@ class SerialPort(Port):
 
     def _complain(self, refused: MendableError) -> None:
         text = f"{refused}; retrying"
+        if not self._ours.is_set():
+            return
         if text != self.trouble:
             self.trouble = text
             self._log(Event("port_waiting", text, "warning"))
@@ -195,7 +216,7 @@ class SerialPort(Port):
         return False
 
     def _leave(self, error: BaseException | None) -> None:
-        # None: the daemon ends.
+        # None: the daemon ends, or releases the port.
         device, self._device = self._device, None
         if device is None:
             return

@@ -1,0 +1,97 @@
+"""The serial port for `acsard mcu check`, which a running daemon lends if it has the port open."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+
+from acsard.bus.address import address_of
+from acsard.bus.zenoh_sessions import answers
+from acsard.client.connection import Connection, open_connection
+from acsard.core.config.settings import Config
+from acsard.core.values import AcsardError
+from acsard.daemon.serial.blocking import BlockingPort
+from acsard.host import clock
+from acsard.host.errors import InUseError
+from acsard.host.processes import is_daemon_here
+
+CLOSE_TIMEOUT_S = 3.0  # for the daemon to close the port
+
+
+class BorrowedPort(BlockingPort):
+    """A port that the daemon closes until the end. `tell` shows a text to the operator."""
+
+    def __init__(self, config: Config, tell: Callable[[str], None]) -> None:
+        super().__init__(config.mcu.port)
+        self._where, self._port, self._tell = address_of(config), config.mcu.port, tell
+        self._latched: tuple[int, ...] | None = None  # by the daemon; None: nothing is borrowed
+
+    def open(self, baud_rate: int) -> None:
+        try:
+            super().open(baud_rate)
+        except InUseError as error:
+            self._borrow(error)
+            self._open_soon(baud_rate)
+
+    def close(self) -> None:
+        try:
+            super().close()
+        finally:
+            self._give_back()
+
+    def _open_soon(self, baud_rate: int) -> None:
+        end_s = clock.steady_s() + CLOSE_TIMEOUT_S
+        while True:
+            try:
+                super().open(baud_rate)
+            except InUseError:
+                if clock.steady_s() > end_s:
+                    self._give_back()
+                    raise
+                time.sleep(0.05)
+            else:
+                return
+
+    def _borrow(self, in_use: InUseError) -> None:
+        with self._daemon(in_use) as robot:
+            info = robot.get("info")
+            ours = is_daemon_here(info.pid) and _device(info.port) == _device(self._port)
+            if not ours:
+                raise in_use
+            reply = robot.call("deactivate", release_port=True)
+        if not reply.success:
+            raise InUseError(f"the daemon keeps {self._port}: {reply.message}")
+        self._latched = tuple(reply.data.numbers)
+        self._tell("the daemon has switched the robot off, and lends the port for this check")
+
+    def _give_back(self) -> None:
+        numbers, self._latched = self._latched, None
+        if numbers is None:
+            return
+        try:
+            with open_connection(self._where) as robot:
+                # A robot that was switched off before the check stays so: it refuses this call, but
+                # opens the port.
+                robot.call("activate", numbers=list(numbers))
+        except AcsardError as error:
+            self._tell(f"the daemon did not take the port back ({error}): `acsard call activate`")
+        else:
+            self._tell("the daemon has the port again; each sender must send a zero first")
+
+    @contextmanager
+    def _daemon(self, in_use: InUseError) -> Iterator[Connection]:
+        if not answers(self._where.endpoint):
+            raise in_use
+        try:
+            with open_connection(self._where) as robot:
+                yield robot
+        except InUseError:
+            raise
+        except AcsardError as error:
+            raise InUseError(f"{in_use}; the daemon did not lend it: {error}") from None
+
+
+def _device(path: str) -> str:
+    return os.path.realpath(path)
