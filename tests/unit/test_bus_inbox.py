@@ -179,26 +179,20 @@ def test_each_query_gets_the_replies_to_its_ticket_and_then_its_end() -> None:
     assert other.told == ["acsard/stop=2", "dropped"]  # a ROS client sent its query on another key
 
 
-def test_a_client_that_left_and_an_unknown_ticket_block_no_other_reply() -> None:
-    replies, absent, here = Replies("", []), FakeQuery(gone=True), FakeQuery()
-    first, second = issued(replies, absent), issued(replies, here)
-    for ticket in (first, 999, second):
+def test_a_query_that_left_or_cannot_be_ended_blocks_no_other_reply() -> None:
+    errors: list[BaseException] = []
+    replies = Replies("", errors)
+    absent, closed, here = FakeQuery(gone=True), FakeQuery(closed=True), FakeQuery()
+    tickets = [issued(replies, query) for query in (absent, closed, here)]
+    for ticket in (*tickets[:2], 999, tickets[2]):
         replies.send(Reply(ticket, "odom", b"1", ""))
         replies.retire(ticket)
         replies.retire(ticket)
     ended(replies)
-    assert (absent.told, here.told) == (["dropped"], ["odom=1", "dropped"])
-
-
-def test_a_query_that_cannot_be_ended_blocks_no_other_reply() -> None:
-    errors: list[BaseException] = []
-    replies, closed, here = Replies("", errors), FakeQuery(closed=True), FakeQuery()
-    first, second = issued(replies, closed), issued(replies, here)
-    replies.retire(first)
-    replies.send(Reply(second, "odom", b"1", ""))
-    ended(replies)
+    assert (absent.told, closed.told, here.told) == (
+        ["dropped"], ["odom=1"], ["odom=1", "dropped"],
+    )  # fmt: skip
     assert not errors
-    assert here.told == ["odom=1"]
 
 
 def test_the_number_of_tickets_is_limited_until_some_are_retired() -> None:

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import struct
 from typing import Any
-from unittest.mock import Mock
 
 import msgspec
 import pytest
@@ -25,7 +24,6 @@ from acsard.core.messages.encodings import (
     encode,
     encoding_name,
 )
-from acsard.core.messages.frames import EXAMPLE
 from acsard.core.messages.report import Report
 from acsard.core.messages.schema import (
     Change,
@@ -317,13 +315,3 @@ def test_a_frame_equals_the_encoders_output(form: Format, several: list[Estimate
     for estimate in several:
         for topic in report._feedback:
             assert topic.encode(estimate, form) == encode(topic.build(estimate), form)
-
-
-def test_only_the_first_message_of_an_encoding_is_built() -> None:
-    """Otherwise the frames would save no time."""
-    for topic in Report(Config(), Instant(0, 0))._feedback:
-        topic.build = Mock(wraps=topic.build)
-        for _ in range(10):
-            topic.encode(EXAMPLE, "msgpack")
-            topic.encode(EXAMPLE, "cdr")
-        assert topic.build.call_count == 2

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import json
 import os
-import random
 import time
-from collections import Counter
 from pathlib import Path
 
 import pytest
@@ -14,16 +12,9 @@ from msgspec.structs import replace
 
 from acsard.core.values import Event
 from acsard.host.errors import Exit
-from acsard.recording.file import MAGIC
 from tests.scenarios.taped import Tape
 from tests.scenarios.world import START, World
 from tests.system.typed import typed
-
-HARMED = 40
-"""Number of damaged files; every verb processes each of them."""
-
-ENDINGS = {"show": "", "replay": "", "export": ".mcap", "report": ".html"}
-"""Maps each verb to the suffix of the file that it makes."""
 
 STEPS = 200
 """Number of steps in each file, about a second."""
@@ -124,46 +115,3 @@ def test_recorded_texts_cannot_send_control_characters_to_the_terminal(tmp_path:
         code, out, _ = log(tmp_path, *words)
         assert (code, "stop" in out) == (0, True)
         assert all(line.isprintable() for line in out.splitlines())
-
-
-def harmed(data: bytes, dice: random.Random) -> bytes:
-    """Return the data of a recording with one kind of damage.
-
-    The data is truncated in or after the first frame, or damaged in one or many places.
-    """
-    begin = data.find(MAGIC, 4)
-    kind = dice.randrange(4)
-    if kind < 2:
-        return data[: dice.randrange(begin, len(data)) if kind else dice.randrange(begin)]
-    bad = bytearray(data)
-    for _ in range(1 if kind == 2 else dice.randint(2, 20)):
-        bad[dice.randrange(begin if kind == 2 else 0, len(bad))] ^= dice.randrange(1, 256)
-    return bytes(bad)
-
-
-@pytest.mark.slow
-def test_no_verb_raises_on_truncated_or_damaged_recordings(tmp_path: Path) -> None:
-    """Recordings may begin with the daemon's start or a saved state."""
-    tape, dice, ends = Tape(every=200), random.Random(6), Counter[int]()
-    world = World(recorder=tape)
-    world.drive(0.5, seconds=2.0)
-    world.call("stop")
-    world.run(0.5)
-    sound = [tape.save(tmp_path / f"{first}.rec.zst", first=first) for first in (0, 200)]
-    where = tmp_path / "record"
-    where.mkdir()
-    for number in range(HARMED):
-        path = where / name(number)
-        path.write_bytes(harmed(sound[number % len(sound)].read_bytes(), dice))
-        for verb, ending in ENDINGS.items():
-            new = [str(tmp_path / f"{number}{ending}")] if ending else []
-            code, out, err = log(where, verb, str(path), *new)
-            assert code in (Exit.OK, Exit.FAILURE, Exit.INCOMPLETE), (verb, out, err)
-            assert bool(out or err), verb
-            assert "Traceback" not in err
-            ends[code] += 1
-    code, out, _ = log(where)
-    assert (code, len(out.splitlines())) == (Exit.OK, HARMED)
-    assert min(ends[Exit.OK], ends[Exit.INCOMPLETE]) > HARMED / 4, ends
-    code, out, err = log(where, "show", "--from", "2000-01-01")
-    assert (code, "  stop: " in out, "Traceback" in err) == (Exit.OK, True, False)

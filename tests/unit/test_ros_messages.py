@@ -6,7 +6,6 @@ import math
 from typing import Any
 
 import pytest
-from mcap_ros2._vendor.rosidl_adapter.parser import parse_message_string
 from msgspec import Struct, inspect
 from msgspec.structs import replace
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
@@ -29,7 +28,6 @@ from acsard.core.ros.channels import (
     CHANNELS,
     CMD_VEL_IN,
     DEFINITIONS,
-    SEPARATOR_LINE,
     STATE_CHANNEL,
     Channel,
     nested,
@@ -120,26 +118,6 @@ def test_a_schema_text_has_every_type_that_it_needs_and_the_constants_of_ros(nam
     assert {name, *nested(name)} == set(types)
     if not name.startswith(ACSARD_PREFIX):
         assert types[name][0] == get_typestore(Stores.ROS2_JAZZY).fielddefs[name][0]
-
-
-def test_a_schema_text_has_the_type_first_and_then_each_needed_type_once() -> None:
-    text = schema_text("nav_msgs/msg/Odometry")
-    first, *others = text.split(f"{SEPARATOR_LINE}\nMSG: ")
-    assert first == (
-        "std_msgs/Header header\nstring child_frame_id\n"
-        "geometry_msgs/PoseWithCovariance pose\ngeometry_msgs/TwistWithCovariance twist\n"
-    )
-    assert [other.partition("\n")[0] for other in others] == [
-        "std_msgs/Header", "builtin_interfaces/Time",
-        "geometry_msgs/PoseWithCovariance", "geometry_msgs/Pose", "geometry_msgs/Point",
-        "geometry_msgs/Quaternion",
-        "geometry_msgs/TwistWithCovariance", "geometry_msgs/Twist", "geometry_msgs/Vector3",
-    ]  # fmt: skip
-    first, *_ = schema_text("geometry_msgs/msg/Quaternion").split(SEPARATOR_LINE)
-    fields = parse_message_string("geometry_msgs", "Quaternion", first).fields
-    assert [(field.name, field.default_value) for field in fields] == [
-        ("x", 0.0), ("y", 0.0), ("z", 0.0), ("w", 1.0),
-    ]  # fmt: skip
 
 
 # the log and the state

@@ -26,17 +26,6 @@ VALUES = {
 """A value for each name in the texts."""
 
 
-def test_the_types_have_exactly_the_codes_of_the_table() -> None:
-    assert set(get_args(Code)) == set(CODES)
-
-
-def test_each_code_is_in_the_program() -> None:
-    """A code that is computed, such as a `WaitCode`, is in the module that computes it."""
-    paths = [path for path in PACKAGE.rglob("*.py") if path.name != "codes.py"]
-    code = "\n".join(path.read_text(encoding="utf-8") for path in paths)
-    assert [name for name in CODES if f'"{name}"' not in code] == []
-
-
 def test_the_page_lists_the_codes_of_the_sources_with_the_first_words_of_their_texts() -> None:
     page = (PACKAGE.parent / "deploy/manual/pages/reference/reasons.md").read_text(encoding="utf-8")
     table = page.partition("| code | first words of the reason |")[2].partition("\n\n")[0]
