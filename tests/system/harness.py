@@ -489,17 +489,6 @@ class Peer:
         finally:
             self._listens.set()
 
-    def stuff(self) -> int:
-        """Fill the kernel's buffer of bytes to this board with line ends. Return their number."""
-        assert self._ends is not None
-        os.set_blocking(self._ends[1], False)
-        size = 0
-        try:
-            while True:
-                size += os.write(self._ends[1], b"\r\n")
-        except BlockingIOError:
-            return size
-
     def send(self, data: bytes) -> None:
         """Send bytes without being asked."""
         assert self._ends is not None
@@ -974,16 +963,6 @@ def kept_waiting(pid: int) -> float:
     such a process loses more time than the bystander, which has one thread.
     """
     return sum(waits_for_a_core(pid).values())
-
-
-def delayed_s(before: dict[int, float], after: dict[int, float], pid: int) -> float:
-    """Return how long a busy machine may have delayed the control loop, s.
-
-    The sum has two parts: the loop's own wait for a core, and the longest wait of another thread,
-    which may have held the Python interpreter.
-    """
-    waits = {thread: waited - before.get(thread, 0.0) for thread, waited in after.items()}
-    return waits.pop(pid) + max(waits.values(), default=0.0)
 
 
 def silences(times: Sequence[float], longest: float = 0.2) -> float:

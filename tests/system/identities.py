@@ -21,9 +21,6 @@ Identity = Literal[
 ADMITTED: tuple[Identity, ...] = ("local", "viewer", "operator", "maintainer")
 """Plain TCP on this machine, and the certificates that `acsard tls init` makes."""
 
-STRANGERS: tuple[Identity, ...] = ("unlisted", "nobody", "foreign", "expired")
-"""A valid but unlisted certificate, no certificate, another CA's operator, and an expired one."""
-
 
 class Certificates:
     """The certificates of one robot and of unauthorised clients, below a directory."""

@@ -98,18 +98,6 @@ session.close()
 )
 """Sends one zero, then `speed` m/s as fast as one process can for `seconds`."""
 
-DELETES = (
-    _OPEN
-    + """
-session = open_session(sys.argv[1])
-publisher = session.declare_publisher("acsard/acsar/stop")
-print("deleting", flush=True)
-while True:
-    publisher.delete()
-"""
-)
-"""DELETEs `stop` as fast as one process can, for ever."""
-
 
 COMMANDER = (
     _OPEN
@@ -168,37 +156,6 @@ while True:
 )
 """Sends zeros for 0.3 s every second and 0.3 m/s in between, for ever, also to the next daemon."""
 
-CODED_FLOOD = (
-    _OPEN
-    + """
-session = open_session(sys.argv[1])
-base, slope, seconds = (float(word) for word in sys.argv[2:5])
-key = "acsard/acsar/cmd/app"
-text = '{"linear": {"x": %.5f}, "angular": {"z": 0}}'
-session.put(key, text % 0, attachment=SENDER)
-time.sleep(0.05)
-publisher, count, payload, until, sent = session.declare_publisher(key), 0, "", 0.0, []
-start = time.monotonic()
-print("flooding", repr(start), flush=True)
-while (now := time.monotonic()) < start + seconds:
-    if now < until:
-        publisher.put(payload, attachment=SENDER)
-    else:
-        payload, until = text % (base + slope * (now - start)), now + 0.0005
-        publisher.put(payload, attachment=SENDER)
-        sent.append((round(now - start, 6), round(time.monotonic() - start, 6)))
-    count += 1
-print("flooded", count, flush=True)
-print("sent", json.dumps(sent), flush=True)
-session.close()
-"""
-)
-"""Sends one zero, then commands as fast as one process can.
-
-Each command encodes the time it was written as its speed, `base + slope * t` m/s. At the end it
-prints when each command was written and when its first put returned. A process that floods a
-machine is itself delayed between these two, and between two commands.
-"""
 
 HOARDER = (
     _OPEN.replace(
@@ -227,9 +184,6 @@ print("routing", repr(time.monotonic()), flush=True)
 time.sleep(600)
 """
 """A Zenoh router at an address, connected to the routers at the other addresses."""
-
-BUSY = "while True: pass"
-"""Keeps a core busy."""
 
 
 def command_line(program: str, *arguments: object) -> list[str]:

@@ -119,13 +119,7 @@ def test_two_directly_connected_daemons_report_it_and_a_wildcard_stop_reaches_on
             assert bus.state()["mode"] != "stopped"
 
 
-def test_a_daemon_without_a_connect_endpoint_reports_nothing_about_routers(tmp_path: Path) -> None:
-    with Daemon(tmp_path) as daemon, Bus(daemon.endpoint) as bus:
-        assert row(bus) is None
-        assert daemon.events("router_missing") == []
-
-
-@pytest.mark.parametrize("routers", [1, 2])
+@pytest.mark.parametrize("routers", [1, pytest.param(2, marks=pytest.mark.nightly)])
 def test_the_zeros_of_a_program_behind_routers_release_no_other_program(
     tmp_path: Path, routers: int
 ) -> None:

@@ -6,7 +6,7 @@ from functools import partial
 
 import zenoh
 
-from acsard.daemon.bus.inbox import COMMAND_BUFFER, MAX_OPEN_QUERIES, Inbox, Replies
+from acsard.daemon.bus.inbox import MAX_OPEN_QUERIES, Inbox, Replies
 from tests.system.harness import Bus, client_config, free_endpoint, until
 
 
@@ -60,29 +60,3 @@ def test_a_step_takes_at_most_one_query_for_settings() -> None:
         until(all_here, 5.0, "all of them")
         assert names.count("srv/set") == 5
         del queryables, asked
-
-
-def test_a_flood_under_two_certificates_displaces_no_command_of_other_senders() -> None:
-    prefix, endpoint = "acsard/acsar/", free_endpoint()
-    inbox = Inbox(prefix, Replies(prefix, []), ("app", "nav"), Deaf())
-    with zenoh.open(client_config(endpoint, "router")) as robot, Bus(endpoint) as bus:
-        keys: list[str] = []
-
-        def take(sample: zenoh.Sample) -> None:
-            inbox.on_sample(sample)
-            keys.append(str(sample.key_expr).removeprefix(prefix))
-
-        subscribers = [
-            robot.declare_subscriber(f"{prefix}{key}", take) for key in ("cmd/*", "cmd/*/*")
-        ]
-        quiet = ["cmd/app", "cmd/nav", "cmd/nav/anna"]
-        flood = [f"cmd/app/{name}" for name in ("anna", "ben")] * COMMAND_BUFFER
-        for key in (*quiet, *flood):
-            bus.session.put(prefix + key, b"", congestion_control=zenoh.CongestionControl.BLOCK)
-        until(lambda: len(keys) == len(quiet) + len(flood), 5.0, "all of them")
-        batch = inbox.take(0)
-        queue = [arrival.key for arrival in batch.arrivals]
-        assert sorted(set(queue)) == sorted({*quiet, *flood})
-        assert [queue.count(key) for key in quiet] == [1, 1, 1]
-        assert (len(queue), batch.overrun) == (len(quiet) + COMMAND_BUFFER, COMMAND_BUFFER)
-        del subscribers

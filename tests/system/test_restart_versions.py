@@ -14,7 +14,6 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from signal import SIGTERM
 from typing import Any, NamedTuple
-from urllib.request import urlopen
 
 import pytest
 import zstandard
@@ -241,20 +240,6 @@ def test_each_method_of_the_python_client_works_with_the_other_version(pair: Pai
     success, text = done["strict"]
     assert success is False
     assert "unknown field `zaw`" in text
-
-
-def state_of(address: str) -> dict[str, Any]:
-    with urlopen(f"{address}/api/state", timeout=10) as answer:
-        return dict(json.load(answer))
-
-
-def called(socket: Any, verb: str) -> dict[str, Any]:
-    """Call a service over the page's WebSocket, and return the answer or the refusal."""
-    socket.send(json.dumps({"call": verb, "id": verb}))
-    while True:
-        message = json.loads(socket.recv(timeout=10))
-        if message.get("answer") == verb or "refused" in message:
-            return dict(message)
 
 
 INVITE = """\
