@@ -226,6 +226,8 @@ def matrix() -> str:
         "# What every program may rely on, through every door",
         "",
         "`test_contract.py` tries each cell: `yes` holds, `-` is not offered through this door.",
+        "The bridge is emulated: the real one with DDS has to be built, and is not in this matrix.",
+        "`pytest -m bridge` tries it in `test_ros.py` and `test_ros_dds.py`.",
         "`python -m tests.system.contract` writes this page.",
         "",
         *(f"{number}. {row.__doc__}" for number, row in enumerate(ROWS.values(), 1)),

@@ -21,7 +21,6 @@ import numpy as np
 import pytest
 import zenoh
 
-from tests.system.builds import BUILD_S
 from tests.system.harness import (
     Bus,
     Daemon,
@@ -38,7 +37,6 @@ from tests.system.ros_clients import (
     TWIST,
     WHEELS,
     BridgeHalf,
-    Client,
     RmwClient,
     ZenohClient,
     decode,
@@ -352,7 +350,7 @@ class Ros(Door):
         "end": BARE,
     }
     source, numbers = "nav", False
-    ros: Client
+    ros: ZenohClient
 
     def send(self, linear: float, angular: float = 0.0) -> None:
         self.ros.put("cmd_vel", TWIST, ros_twist(linear, angular))
@@ -371,17 +369,14 @@ class Ros(Door):
 
     def bad(self) -> dict[str, Send]:
         put, few = self.ros.put, joints(6.0, WHEELS[:3])
-        refused: dict[str, Send] = {
+        ros, whole, key = self.ros, ros_twist(0.5), self.ros.key("cmd_vel", TWIST)
+        return {
             "not_finite": lambda: put("cmd_vel", TWIST, ros_twist(float("nan"))),
             "wrong_wheels": lambda: put("joint_commands", JOINTS, few),
+            "malformed": lambda: put("cmd_vel", TWIST, whole[:-1]),
+            "too_big": lambda: put("cmd_vel", TWIST, whole + bytes(5000)),
+            "not_a_put": lambda: ros.session.delete(key, attachment=ros.attachment()),
         }
-        ros = self.ros
-        if isinstance(ros, ZenohClient):  # a real node sends no damaged message
-            whole, key = ros_twist(0.5), ros.key("cmd_vel", TWIST)
-            refused["malformed"] = lambda: put("cmd_vel", TWIST, whole[:-1])
-            refused["too_big"] = lambda: put("cmd_vel", TWIST, whole + bytes(5000))
-            refused["not_a_put"] = lambda: ros.session.delete(key, attachment=ros.attachment())
-        return refused
 
     def set(self, key: str, value: float) -> bool:
         kind = PARAMETER_SERVICES["set_parameters"]
@@ -431,18 +426,6 @@ class Bridge(Ros):
         time.sleep(1.1)
 
     def bad(self) -> dict[str, Send]:
-        refused, between = super().bad(), ros_twist(0.5) + bytes(8)
-        if isinstance(self.ros, BridgeHalf):  # neither a Twist nor a TwistStamped
-            refused["wrong_shape"] = lambda: self.bus.session.put("cmd_vel", between)
-        return refused
-
-
-class RealBridge(Bridge):
-    name = "ros2dds bridge and DDS"
-    marks = (pytest.mark.bridge, pytest.mark.timeout(BUILD_S))
-
-    def open(self) -> None:
-        dds = self.robot.request.getfixturevalue("dds")
-        domain = self.stack.enter_context(dds(self.robot.where))
-        self.stack.enter_context(domain.bridge(self.robot.endpoint))
-        self.ros = self.stack.enter_context(domain.node())
+        between = ros_twist(0.5) + bytes(8)  # neither a Twist nor a TwistStamped
+        put = self.bus.session.put
+        return super().bad() | {"wrong_shape": lambda: put("cmd_vel", between)}

@@ -30,7 +30,6 @@ from tests.system.doors import (
     Gateway,
     Json,
     Msgpack,
-    RealBridge,
     Rmw,
     Router,
     Send,
@@ -424,6 +423,6 @@ class Go(Example):
 
 
 DOORS: tuple[type[Door], ...] = (
-    Json, Msgpack, Rmw, Bridge, RealBridge, WebSocket, Foxglove, CommandLine, Sync, Async, Curl,
+    Json, Msgpack, Rmw, Bridge, WebSocket, Foxglove, CommandLine, Sync, Async, Curl,
     Node, Java, Go, Gateway, Router,
 )  # fmt: skip

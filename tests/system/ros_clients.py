@@ -624,24 +624,6 @@ def changes(before: Any, after: Any) -> dict[str, int]:
     }
 
 
-def refused_without_motion(bus: Bus, send: Callable[[], None], reason: str, text: str) -> None:
-    before = bus.state()
-    send()
-    counted = before["counters"].get(f"command_{reason}", 0)
-    until(
-        lambda: bus.count(f"command_{reason}") > counted,
-        3.0,
-        f"counted as {reason}, but {changes(before, bus.state())}",
-    )
-    lines = bus.count("lines_sent")
-    until(lambda: bus.count("lines_sent") >= lines + 2, 3.0, "two more lines")
-    after = bus.state()
-    assert text in after["refused"], after["refused"]
-    assert changes(before, after).keys() == {f"command_{reason}"}
-    for key in ("x", "y", "yaw", "linear", "angular", "wheels"):
-        assert after[key] == before[key], key
-
-
 def behind(bus: Bus, send: Callable[[], None], reason: str) -> None:
     """Wait until the daemon has received all earlier messages of this client.
 
@@ -697,16 +679,6 @@ from rosbags.typesys import Stores, get_typestore
 port, hashes = int(sys.argv[1]), json.loads(sys.argv[2])
 router = {"router_ip": "127.0.0.1", "router_port": port}
 store = get_typestore(Stores.ROS2_JAZZY)
-SERVICES = {
-    "std_srvs/srv/Trigger": ("# blank", "bool success\\nstring message"),
-    "rcl_interfaces/srv/ListParameters": (
-        "string[] prefixes\\nuint64 depth", "rcl_interfaces/ListParametersResult result"
-    ),
-    "rcl_interfaces/srv/GetParameters": (
-        "string[] names", "rcl_interfaces/ParameterValue[] values"
-    ),
-}
-
 def definition(type_name):
     return {
         "msg_definition": store.generate_msgdef(type_name, ros_version=2)[0],
@@ -789,19 +761,13 @@ def drive(prefix, topic, type_name, speed, names, wanted):
     publisher.publish(**fields(type_name, 0.0, names))
     return top
 
-def call(service, type_name, **request):
+def call(service, type_name):
     if service not in callers:
-        blank, answer = SERVICES[type_name]
-        parts = [answer]
-        for used in ("ListParametersResult", "ParameterValue"):
-            if used in answer:
-                text = store.generate_msgdef("rcl_interfaces/msg/" + used, ros_version=2)[0]
-                parts += ["=" * 80, "MSG: rcl_interfaces/" + used, text]
         callers[service] = sdk.ROS2ServiceClient(
-            service, type_name, request_definition=blank,
-            response_definition="\\n".join(parts), type_hash="RIHS01_" + hashes[type_name],
-            timeout=5.0, **router)
-    return callers[service].call(**request)
+            service, type_name, request_definition="# blank",
+            response_definition="bool success\\nstring message",
+            type_hash="RIHS01_" + hashes[type_name], timeout=5.0, **router)
+    return callers[service].call()
 
 def topics():
     return sdk.get_topic_names_and_types(**router)

@@ -5,7 +5,6 @@ These tests emulate the bridge. `test_ros_dds.py` tests the real bridge.
 
 from __future__ import annotations
 
-import time
 from pathlib import Path
 
 import pytest
@@ -14,7 +13,6 @@ from tests.system.harness import Bus, Daemon, running, until
 from tests.system.ros_clients import (
     HASHES,
     JOINTS,
-    ODOMETRY,
     PUBLISHED,
     QUICK,
     SERVICES,
@@ -23,12 +21,10 @@ from tests.system.ros_clients import (
     BridgeHalf,
     RmwClient,
     changes,
-    decode,
     listed,
     session_at,
     stamped,
     twist,
-    unharmed,
 )
 
 pytestmark = pytest.mark.network
@@ -44,16 +40,6 @@ def ros(bus: Bus) -> BridgeHalf:
 # the bridge's Zenoh half
 
 
-def test_the_odometry_comes_as_plain_cdr(ros: BridgeHalf) -> None:
-    with ros.follow("odom", ODOMETRY) as samples:
-        sample = samples.first("odometry")
-    message = decode(ODOMETRY, sample.payload)
-    assert (len(sample.payload), sample.attachment) == (724, b"")
-    assert (message.header.frame_id, message.child_frame_id) == ("odom", "base_link")
-    stamp = message.header.stamp
-    assert stamp.sec + stamp.nanosec / 1e9 == pytest.approx(time.time(), abs=5.0)
-
-
 def test_a_twist_has_52_bytes_and_a_stamped_twist_76(bus: Bus, ros: BridgeHalf) -> None:
     plain = twist(0.0)
     assert (len(plain), len(stamped(0.0))) == (52, 76)
@@ -66,28 +52,6 @@ def test_a_twist_has_52_bytes_and_a_stamped_twist_76(bus: Bus, ros: BridgeHalf) 
 
 
 # bad messages
-
-
-def test_the_bridge_keys_ignore_an_attachment(bus: Bus, ros: BridgeHalf) -> None:
-    before = bus.state()
-    for attachment in (b"rqh" + bytes(17), bytes(33), b"\xff" * 60_000):
-        count = bus.count("commands")
-        bus.session.put("cmd_vel", twist(0.0), attachment=attachment)
-        _more(bus, count)
-    assert changes(before, bus.state()) == {"commands": 3}
-
-
-def test_a_reply_has_no_attachment(ros: BridgeHalf) -> None:
-    assert ros.call("acsard/reset_odometry").replies[0].attachment == b""
-
-
-def _more(bus: Bus, before: int) -> None:
-    until(lambda: bus.count("commands") > before, 3.0, "one more command")
-
-
-def test_no_bridge_message_raised_an_exception_in_the_daemon(bus: Bus, shared: Daemon) -> None:
-    unharmed(shared)
-    bus.at_rest()
 
 
 # announcements

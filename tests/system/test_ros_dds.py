@@ -28,25 +28,17 @@ from tests.system.ros_clients import (
     PUBLISHED,
     ROUTE_S,
     SERVICES,
-    SPEED_LIMIT,
     STAMPED,
     TF,
     TWIST,
     Relay,
-    Samples,
     changes,
     decode,
-    encode,
-    header,
-    make,
     over_router,
-    refused_without_motion,
-    released,
     stamped,
     twist,
     two_robots,
     undisturbed,
-    unharmed,
 )
 from tests.system.test_ros_drive import LINE
 
@@ -108,20 +100,6 @@ def test_announced_topics_have_routes_and_no_topic_is_sent_without_subscribers(
         print(f"announced and unheard: {byte_count} bytes in 50 periods")
         assert byte_count < 2000
         assert not [line for line in bridge.log if "WARN" in line or "ERROR" in line]
-
-
-def test_a_command_has_the_time_at_which_the_bridge_sent_it(driven: Bus, domain: DdsDomain) -> None:
-    samples = Samples()
-    subscribers = [driven.session.declare_subscriber(key, samples.add) for key in ("cmd_vel", "tf")]
-    with domain.node() as node:
-        node.publish_until_accepted(driven, "cmd_vel", TWIST, twist(0.0))
-        command = samples.first("a command", lambda s: s.key == "cmd_vel")
-    of_daemon = samples.first("a transform", lambda s: s.key == "tf").origin
-    for subscriber in subscribers:
-        subscriber.undeclare()
-    assert (command.payload, command.attachment) == (twist(0.0), b"")
-    assert of_daemon in map(str, driven.session.info.peers_zid())
-    assert command.origin not in ("", of_daemon)
 
 
 # two publishers
@@ -219,17 +197,6 @@ def test_an_idle_stamped_publisher_blocks_twist_until_both_publishers_have_ended
         states.find(lambda s: (s["linear"] or 0.0) > 0.1, 5.0, "it drives")
 
 
-def test_a_publisher_of_a_type_that_is_no_command_moves_nothing(
-    driven: Bus, domain: DdsDomain
-) -> None:
-    with domain.node() as node:
-        node.publish_until_accepted(driven, "cmd_vel", TWIST, twist(0.0))
-    with domain.node() as node:
-        limit = encode(make(SPEED_LIMIT, header=header(), percentage=False, speed_limit=0.3))
-        send = lambda: node.put("cmd_vel", SPEED_LIMIT, limit)  # noqa: E731
-        refused_without_motion(driven, send, "malformed", "")
-
-
 # two robots
 
 
@@ -313,13 +280,6 @@ def test_a_command_to_one_robot_drives_only_that_one(fleet: tuple[Robot, Robot])
     driven.bus.at_rest()
 
 
-def test_a_stop_of_one_robot_stops_only_that_one(fleet: tuple[Robot, Robot]) -> None:
-    first, second = fleet
-    assert first.node.call("acsard/stop").trigger()[0]
-    assert (first.bus.state()["mode"], second.bus.state()["mode"]) == ("stopped", "ready")
-    released(first.node)
-
-
 def test_each_robot_has_all_its_topics_and_its_own_static_transforms(
     fleet: tuple[Robot, Robot],
 ) -> None:
@@ -328,11 +288,6 @@ def test_each_robot_has_all_its_topics_and_its_own_static_transforms(
             follow = robot.node.follow_late if late else robot.node.follow
             with follow(name, kind) as samples:
                 decode(kind, samples.first(name).payload)
-
-
-def test_no_dds_node_raised_an_exception_in_a_daemon(fleet: tuple[Robot, Robot]) -> None:
-    for robot in fleet:
-        unharmed(robot.daemon)
 
 
 # the first drive

@@ -6,20 +6,18 @@ import queue
 import struct
 import time
 from collections.abc import Iterator
-from contextlib import AbstractContextManager, ExitStack
+from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import pytest
 import zenoh
 
-from tests.system.harness import Bus, Daemon, client_config, free_endpoint, running, until
+from tests.system.harness import Bus, Daemon, client_config, free_endpoint, until
 from tests.system.ros_clients import (
-    EMPTY_REQUEST,
     GET,
     JOINTS,
-    LIST,
     ODOMETRY,
     PUBLISHED,
     QUICK,
@@ -37,15 +35,11 @@ from tests.system.ros_clients import (
     Samples,
     Sdk,
     ZenohClient,
-    behind,
-    changes,
-    decode,
     encode,
     gid_of,
     make,
     over_router,
     rmw_key,
-    twist,
     two_robots,
     undisturbed,
     unharmed,
@@ -62,16 +56,6 @@ COMMANDS = (
 )
 """Topic, type and the value in m/s or rad/s; all result in 0.3 m/s."""
 
-WAYS = {
-    "peer of a router": COMMANDS,
-    "client of a router": COMMANDS[:1],
-    "no router": COMMANDS[-1:],
-}
-"""How the robot and ROS reach each other, and the commands tried in that way.
-
-The keys are the same in all of them.
-"""
-
 
 class Fleet(NamedTuple):
     """Two robots and a process of the ROS 2 SDK on one router.
@@ -79,7 +63,6 @@ class Fleet(NamedTuple):
     `one` is connected as a Zenoh peer, and `two` as a Zenoh client.
     """
 
-    daemons: dict[str, Daemon]
     one: Bus
     two: Bus
     sdk: Sdk
@@ -94,44 +77,24 @@ def fleet(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Fleet]:
         over_router(meeting, "one") as first,
         over_router(meeting, "two") as second,
     ):
-        yield Fleet(daemons, first, second, sdk)
+        yield Fleet(first, second, sdk)
+        assert "Traceback" not in sdk.stderr
+        for daemon in daemons.values():
+            unharmed(daemon)
 
 
-class Ground(NamedTuple):
-    """A robot and a process of the ROS 2 SDK, connected in one of the ways that are tested."""
-
-    daemon: Daemon
-    bus: Bus
-    sdk: Sdk
-    commands: tuple[tuple[str, str, float], ...]
-    prefix: str
-    """The prefix of each ROS name."""
-
-
-@pytest.fixture(scope="module", params=WAYS)
-def ground(
-    request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
-) -> Iterator[Ground]:
-    commands = WAYS[request.param]
-    if request.param != "no router":
-        fleet: Fleet = request.getfixturevalue("fleet")
-        name, bus = ("one", fleet.one) if "peer" in request.param else ("two", fleet.two)
-        yield Ground(fleet.daemons[name], bus, fleet.sdk, commands, f"/{name}")
-        return
-    where = tmp_path_factory.mktemp("ground")
-    with (
-        running(where, config=QUICK) as (daemon, bus),
-        Sdk(daemon.endpoint, where) as sdk,
-    ):
-        yield Ground(daemon, bus, sdk, commands, "")
+@pytest.fixture(autouse=True)
+def unharmed_after(shared: Daemon) -> Iterator[None]:
+    yield
+    unharmed(shared)
 
 
 # an independent implementation
 
 
-def test_an_independent_client_decodes_the_odometry(ground: Ground) -> None:
-    ground.sdk.do("follow", ground.prefix + "/odom", ODOMETRY)
-    odometry = ground.sdk.do("newest", ground.prefix + "/odom")
+def test_an_independent_client_decodes_the_odometry(fleet: Fleet) -> None:
+    fleet.sdk.do("follow", "/one/odom", ODOMETRY)
+    odometry = fleet.sdk.do("newest", "/one/odom")
     assert (odometry["header"]["frame_id"], odometry["child_frame_id"]) == ("odom", "base_link")
     assert odometry["pose"]["pose"]["orientation"]["w"] == pytest.approx(1.0, abs=1e-3)
     assert len(odometry["pose"]["covariance"]) == 36
@@ -139,86 +102,55 @@ def test_an_independent_client_decodes_the_odometry(ground: Ground) -> None:
     assert stamp["sec"] + stamp["nanosec"] / 1e9 == pytest.approx(time.time(), abs=5.0)
 
 
-def test_an_independent_client_drives_the_robot(ground: Ground) -> None:
-    ground.sdk.do("follow", ground.prefix + "/odom", ODOMETRY)
-    for topic, kind, amount in ground.commands:
-        before = ground.bus.state()
-        top = ground.sdk.do("drive", ground.prefix, topic, kind, amount, WHEELS, 0.2)
+@pytest.mark.parametrize(("robot", "commands"), [("one", COMMANDS), ("two", COMMANDS[:1])])
+def test_an_independent_client_drives_the_robot_behind_a_router_as_a_peer_or_a_client(
+    fleet: Fleet, robot: str, commands: tuple[tuple[str, str, float], ...]
+) -> None:
+    bus: Bus = getattr(fleet, robot)
+    fleet.sdk.do("follow", f"/{robot}/odom", ODOMETRY)
+    for topic, kind, amount in commands:
+        before = bus.state()
+        top = fleet.sdk.do("drive", f"/{robot}", topic, kind, amount, WHEELS, 0.2)
         assert 0.2 <= top <= 0.31, (topic, kind)
-        after = until(lambda: _standing(ground.bus.state()), 5.0, "it stands after a zero")
+        after = bus.stands()
         assert after["x"] > before["x"] + 0.005, (topic, kind)
         # Commands of a new sender count as first contact until its delays are steady. None is
         # refused.
         assert not [key for key in after["counters"] if key.startswith("command_")]
 
 
-def _standing(state: Any) -> Any:
-    return None if any(state["wheels"]) else state
-
-
-def test_an_independent_client_that_comes_late_gets_the_static_transforms(ground: Ground) -> None:
-    topic = ground.prefix + "/tf_static"
-    ground.sdk.do("late", topic, TF)
-    message = until(lambda: ground.sdk.do("held", topic), 1.5, "tf_static")
+def test_an_independent_client_that_comes_late_gets_the_static_transforms(fleet: Fleet) -> None:
+    fleet.sdk.do("late", "/one/tf_static", TF)
+    message = until(lambda: fleet.sdk.do("held", "/one/tf_static"), 1.5, "tf_static")
     frames = [(t["header"]["frame_id"], t["child_frame_id"]) for t in message["transforms"]]
     assert frames == [("base_link", "lidar_link")]
 
 
-def test_an_independent_client_stops_and_clears_the_robot(ground: Ground) -> None:
-    stopped = ground.sdk.do("call", ground.prefix + "/acsard/stop", TRIGGER)
-    assert stopped["success"] is True
-    assert ground.bus.state()["mode"] == "stopped"
-    refused = ground.sdk.do("call", ground.prefix + "/acsard/clear", TRIGGER)
+def test_an_independent_client_stops_and_clears_the_robot(fleet: Fleet) -> None:
+    assert fleet.sdk.do("call", "/one/acsard/stop", TRIGGER)["success"] is True
+    assert fleet.one.state()["mode"] == "stopped"
+    refused = fleet.sdk.do("call", "/one/acsard/clear", TRIGGER)
     assert refused["success"] is False
-    again = "call srv/clear again 2 s after that"
-    assert again in refused["message"]
-    until(
-        lambda: ground.sdk.do("call", ground.prefix + "/acsard/clear", TRIGGER)["success"],
-        5.0,
-        "a plain clear is obeyed",
-    )
-    assert ground.bus.state()["mode"] == "ready"
+    assert "call srv/clear again 2 s after that" in refused["message"]
+    clear = partial(fleet.sdk.do, "call", "/one/acsard/clear", TRIGGER)
+    until(lambda: clear()["success"], 5.0, "a plain clear is obeyed")
+    assert fleet.one.state()["mode"] == "ready"
 
 
-def test_an_independent_client_lists_topics_services_and_the_node(ground: Ground) -> None:
-    prefix = ground.prefix
-    topics = {f"{prefix}/{name}": [kind] for name, (kind, _, _) in PUBLISHED.items()}
-    topics |= {f"{prefix}/{name}": [TWIST, STAMPED] for name in TWISTS}
-    topics |= {f"{prefix}/joint_commands": [JOINTS], f"{prefix}/speed_limit": [SPEED_LIMIT]}
-    services = {f"{prefix}/{name}": [kind] for name, kind in SERVICES.items()}
-    for what, expected in (("topics", topics), ("services", services)):
-        until(partial(_lists, ground.sdk, what, expected), 5.0, f"all {what}")
-    nodes = [[prefix or "/", "acsard", "::,10:,:,:,,"]]
-    until(
-        lambda: ground.sdk.do("nodes", ground.prefix + "/odom") == nodes, 5.0, "who publishes odom"
-    )
+def test_an_independent_client_lists_topics_services_and_the_node(fleet: Fleet) -> None:
+    topics = {f"/one/{name}": [kind] for name, (kind, _, _) in PUBLISHED.items()}
+    topics |= {f"/one/{name}": [TWIST, STAMPED] for name in TWISTS}
+    topics |= {"/one/joint_commands": [JOINTS], "/one/speed_limit": [SPEED_LIMIT]}
+    services = {f"/one/{name}": [kind] for name, kind in SERVICES.items()}
 
+    def lists(what: str, expected: dict[str, list[str]]) -> bool:
+        listing = dict(fleet.sdk.do(what))
+        return all(listing.get(name) == types for name, types in expected.items())
 
-def _lists(sdk: Sdk, what: str, expected: dict[str, list[str]]) -> bool:
-    listing = dict(sdk.do(what))
-    return all(listing.get(name) == types for name, types in expected.items())
-
-
-def test_an_independent_client_lists_and_gets_parameters(ground: Ground) -> None:
-    reply = ground.sdk.do(
-        "call", ground.prefix + "/acsard/list_parameters", LIST, prefixes=[], depth=0
-    )
-    names = reply["result"]["names"]
-    assert {"drive.wheel_radius", "robot.id", "ros.domain"} <= set(names)
-    wanted = ["drive.wheel_radius", "robot.id", "ros.domain", "ros.rmw", "no.such"]
-    reply = ground.sdk.do("call", ground.prefix + "/acsard/get_parameters", GET, names=wanted)
-    prefix_id = ground.prefix.removeprefix("/") or "acsar"
-    radius, robot, domain, rmw, nothing = reply["values"]
-    assert (radius["type"], radius["double_value"]) == (3, 0.05)
-    assert (robot["type"], robot["string_value"]) == (4, prefix_id)
-    assert (domain["type"], domain["integer_value"]) == (2, 0)
-    assert (rmw["type"], rmw["bool_value"]) == (1, True)
-    assert nothing["type"] == 0
-
-
-def test_no_request_of_the_independent_client_raised_an_exception(ground: Ground) -> None:
-    unharmed(ground.daemon)
-    assert "Traceback" not in ground.sdk.stderr
+    until(partial(lists, "topics", topics), 5.0, "all topics")
+    until(partial(lists, "services", services), 5.0, "all services")
+    nodes = [["/one", "acsard", "::,10:,:,:,,"]]
+    until(lambda: fleet.sdk.do("nodes", "/one/odom") == nodes, 5.0, "who publishes odom")
 
 
 # the protocol to the letter
@@ -332,92 +264,13 @@ def test_a_reply_names_its_request(bus: Bus, ros: RmwClient) -> None:
         assert called.seconds < 1.0
 
 
-# bad attachments, keys and requests are refused and counted, and disturb no other client
-
-
-GO = twist(0.5)
-NOW = Attached(1, time.time_ns(), bytes(16)).pack()
-
-
-def test_a_command_of_a_sender_whose_clock_is_an_hour_off_is_accepted(
-    bus: Bus, ros: RmwClient
-) -> None:
-    # Only differences of ages count: clocks need not agree.
-    for off in (3600.0, -3600.0):
-        other = RmwClient(bus.session)
-        before = bus.state()
-        until(partial(_put, bus, other, off, bus.count("commands") + 3), 3.0, f"zeros {off} s off")
-        # A new sender shows its delays first.
-        assert changes(before, bus.state()).keys() <= {"commands", "commands_of_new_senders"}
-
-
-def _put(bus: Bus, other: RmwClient, off: float, enough: int) -> bool:
-    key, attached = other.key("cmd_vel", TWIST), other.attachment(off)
-    bus.session.put(key, twist(0.0), attachment=attached)
-    return bus.count("commands") >= enough
-
-
-def test_a_put_with_another_type_hash_is_ignored(bus: Bus, ros: RmwClient) -> None:
-    ros.zeros(bus)
-    before = bus.state()
-    key = ros.key("cmd_vel", TWIST)
-    for wrong in (key[:-1] + "b", key.replace("Twist_", "Accel_"), key.replace("0/", "1/", 1)):
-        assert wrong != key
-        bus.session.put(wrong, GO, attachment=ros.attachment())
-    behind(bus, lambda: ros.session.put(key, GO), "no_attachment")
-    after = bus.state()
-    assert changes(before, after).keys() == {"command_no_attachment"}
-    assert after["wheels"] == before["wheels"]
-
-
-@pytest.mark.parametrize(
-    ("attachment", "reason"),
-    [(b"", "no_attachment"), (bytes(20), "bad_attachment"), (NOW[:-1], "bad_attachment")],
-    ids=["none", "short", "cut"],
-)
-@pytest.mark.parametrize("service", ["acsard/activate", "acsard/get_parameters"])
-def test_a_call_with_a_wrong_attachment_is_counted_and_ends_without_an_answer(
-    bus: Bus, ros: RmwClient, service: str, attachment: bytes, reason: str
-) -> None:
-    before = bus.state()
-    called = ros.call(service, SERVICES[service], attachment=attachment)
-    assert (called.replies, called.errors) == ([], 0)
-    assert called.seconds < 1.0
-    assert changes(before, bus.state()) == {f"command_{reason}": 1}
-
-
-def test_a_stop_without_attachment_stops_all_the_same(bus: Bus, ros: RmwClient) -> None:
-    before = bus.state()
-    try:
-        called = ros.call("acsard/stop", attachment=b"")
-        assert (called.replies, called.errors) == ([], 0)
-        assert bus.state()["mode"] == "stopped"
-        assert changes(before, bus.state()) == {"command_no_attachment": 1}
-    finally:
-        bus.get("srv/clear")
-
-
-def test_more_names_than_there_are_parameters_are_answered(ros: RmwClient) -> None:
-    for count, answered in ((128, 128), (129, 129), (256, 256), (300, 0), (1000, 0)):
-        names = ["commands.sources.nav.priority"] * count
-        request = encode(make("rcl_interfaces/msg/GetRequest", names=names))
-        (reply,) = ros.call("acsard/get_parameters", GET, request).replies
-        assert len(decode("rcl_interfaces/msg/GetReply", reply.payload).values) == answered
-
-
-@pytest.mark.variations(4)
-@pytest.mark.parametrize("count", [100, 300])
-@pytest.mark.parametrize("service", ["acsard/get_parameters", "acsard/reset_odometry"])
-def test_each_of_many_simultaneous_calls_is_answered(
-    bus: Bus, ros: RmwClient, service: str, count: int
-) -> None:
-    names = encode(make("rcl_interfaces/msg/GetRequest", names=["robot.id"]))
-    request = names if service.endswith("parameters") else EMPTY_REQUEST
+def test_each_of_many_simultaneous_calls_is_answered(ros: RmwClient) -> None:
+    request = encode(make("rcl_interfaces/msg/GetRequest", names=["robot.id"]))
     answers: queue.SimpleQueue[int] = queue.SimpleQueue()
-    asked = [ros.attachment() for _ in range(count)]
+    asked = [ros.attachment() for _ in range(300)]
     for attachment in asked:
         ros.session.get(
-            ros.key(service, SERVICES[service]),
+            ros.key("acsard/get_parameters", GET),
             lambda reply: answers.put(reply.ok is not None),
             payload=request,
             attachment=attachment,
@@ -425,13 +278,7 @@ def test_each_of_many_simultaneous_calls_is_answered(
             consolidation=zenoh.ConsolidationMode.NONE,
             timeout=20.0,
         )
-    assert [answers.get(timeout=20.0) for _ in asked] == [True] * count
-    bus.state()
-
-
-def test_no_ros_client_raised_an_exception_in_the_daemon(bus: Bus, shared: Daemon) -> None:
-    unharmed(shared)
-    bus.at_rest()
+    assert [answers.get(timeout=20.0) for _ in asked] == [True] * 300
 
 
 # two robots
@@ -439,27 +286,19 @@ def test_no_ros_client_raised_an_exception_in_the_daemon(bus: Bus, shared: Daemo
 TREES: dict[str, type[ZenohClient]] = {"bridge": BridgeHalf, "rmw": RmwClient}
 
 
-@pytest.mark.parametrize("tree", ["native", "bridge", "rmw"])
-def test_a_command_to_one_robot_does_not_reach_the_other(fleet: Fleet, tree: str) -> None:
-    driven = fleet.one
-    drive: AbstractContextManager[object]
-    if tree == "native":
-        drive = driven.commanding(0.3)
-    else:
-        drive = TREES[tree](driven.session, "one").driving(driven, "cmd_vel", TWIST, 0.3)
-    with undisturbed(fleet.two), driven.follow("state") as states, drive:
+@pytest.mark.parametrize("tree", TREES)
+def test_a_command_and_a_stop_of_one_robot_do_not_reach_the_other(fleet: Fleet, tree: str) -> None:
+    client = TREES[tree](fleet.one.session, "one")
+    with (
+        undisturbed(fleet.two),
+        fleet.one.follow("state") as states,
+        client.driving(fleet.one, "cmd_vel", TWIST, 0.3),
+    ):
         states.find(lambda s: (s["linear"] or 0.0) > 0.1, 3.0, "it drives")
-
-
-@pytest.mark.parametrize("tree", ["native", "bridge", "rmw"])
-def test_a_stop_of_one_robot_does_not_reach_the_other(fleet: Fleet, tree: str) -> None:
-    first, second = fleet.one, fleet.two
-    if tree == "native":
-        assert first.get("srv/stop")["success"]
-    else:
-        assert TREES[tree](first.session, "one").call("acsard/stop").trigger()[0]
-    assert (first.state()["mode"], second.state()["mode"] != "stopped") == ("stopped", True)
-    assert first.get("srv/clear")["success"]
+    assert client.call("acsard/stop").trigger()[0]
+    assert fleet.one.state()["mode"] == "stopped"
+    assert fleet.two.state()["mode"] != "stopped"
+    assert fleet.one.get("srv/clear")["success"]
 
 
 def test_no_key_is_published_by_two_robots(fleet: Fleet) -> None:
