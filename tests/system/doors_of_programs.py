@@ -66,7 +66,11 @@ class OfClient(Door):
         """Return the address of the gateway, and the directory of a viewer's certificate."""
         stage = self.for_viewer()
         assert stage.own is not None
-        return stage.endpoint, str(stage.own("viewer"))
+        link = stage.endpoint, str(stage.own("viewer"))
+        # A busy machine may let the first connection wait for longer than a client does.
+        asked = ("get", "info", "--connect", link[0], "--tls", link[1])
+        until(lambda: typed(*asked).code == 0, 10.0, "the viewer is let in")
+        return link
 
 
 class Sync(OfClient):

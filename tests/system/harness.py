@@ -730,6 +730,7 @@ class Bus:
         """
         if key in ("srv/clear", "srv/activate") and payload is None:
             states = self.ask("state")
+            assert all(answer.ok for answer in states), f"the query of {self.root}/state: {states}"
             causes = json.loads(states[0].payload)["causes"] if states else []
             payload = {"numbers": [cause["number"] for cause in causes]} if states else None
         return None if payload is None else json.dumps(payload)

@@ -10,25 +10,21 @@ import subprocess
 import time
 from collections.abc import Iterator
 from pathlib import Path
-from unittest import mock
 
 import pytest
 import zenoh
-from cryptography.hazmat.primitives.asymmetric import ec
 from msgspec.structs import replace
 
 from acsard.bus.certificate_watch import FILES_CHECK_PERIOD_NS
 from acsard.bus.tls import KEY, peer_ends_ns
 from acsard.core.config.settings import BusConfig, Config
 from acsard.core.values import NS_PER_S
-from acsard.daemon.gateway.session_health import MAX_UNANSWERED
 from acsard.daemon.gateway.tls_gateway import Gateway
-from acsard.host.errors import CertificateError, InUseError
+from acsard.host.errors import InUseError
 from acsard.machine.authority import Authority
 from tests.system.harness import (
     Bus,
     Daemon,
-    Program,
     acsard,
     children,
     finish,
@@ -134,7 +130,7 @@ def test_a_new_certificate_is_used_and_the_daemon_runs_on(tmp_path: Path) -> Non
             until(lambda: bus.state()["certificate_expiry"] == expiry, 5.0, expiry)
 
 
-@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM])
 def test_the_gateway_closes_with_the_daemon(robot: Open, number: signal.Signals) -> None:
     gateway = robot.gateway()
     robot.daemon.signal(number)
@@ -165,16 +161,6 @@ def test_a_gateway_that_is_suspended_is_ended_and_restarted(robot: Open) -> None
     assert "stopped or hung" in line["text"]
 
 
-def test_a_gateway_that_was_suspended_for_two_seconds_is_not_restarted(robot: Open) -> None:
-    gateway = robot.gateway()
-    os.kill(gateway, signal.SIGSTOP)
-    end = time.monotonic() + 2.0
-    until(lambda: time.monotonic() > end, 5.0, "two seconds")
-    os.kill(gateway, signal.SIGCONT)
-    until(robot.lets_in, 5.0, "it goes on")
-    assert robot.gateway() == gateway
-
-
 @pytest.mark.parametrize("paused", ["daemon", "gateway"])
 def test_a_stop_over_tls_that_waits_for_longer_than_two_seconds_stops_the_robot(
     robot: Open, paused: str
@@ -193,20 +179,8 @@ def test_a_stop_over_tls_that_waits_for_longer_than_two_seconds_stops_the_robot(
             os.kill(pid, signal.SIGCONT)
         with Bus(robot.daemon.endpoint) as other:
             until(lambda: other.state()["mode"] == "stopped", 5.0, "the stop arrives")
-
-
-def test_forged_gateway_reports_are_ignored(robot: Open) -> None:
-    huge = b'{"opened": 1, "connections": 0, "full": 1' + b"0" * 400 + b"}"
-    with Bus(robot.daemon.endpoint) as bus:
-        until(
-            lambda: bus.count("gateway_opened") == 1,
-            5.0,
-            "the gateway has reported that it is open",
-        )
-        for payload in (b"", b"{}", b"\xff", huge):
-            bus.session.put("acsard/acsar/gateway", payload)
-        assert bus.ask("info")
-        assert bus.count("gateway_opened") == 1
+        if paused == "gateway":
+            assert robot.gateway() == pid
 
 
 def test_without_a_tls_endpoint_there_is_no_gateway_to_open(tmp_path: Path) -> None:
@@ -223,60 +197,11 @@ def gateway_with(own: Path, tls: str) -> Gateway:
     return Gateway(replace(Config(), bus=bus))
 
 
-def test_a_key_that_zenoh_refuses_is_a_bad_certificate_and_not_an_address_in_use(
-    tmp_path: Path,
-) -> None:
-    authority = Authority.make(tmp_path, "test", 1)
-    # OpenSSL accepts a key of this curve, and Zenoh does not.
-    with mock.patch.object(ec, "SECP256R1", ec.SECP521R1):
-        authority.issue(tmp_path, "robot", [], 1)
-    with pytest.raises(CertificateError, match="failed to parse private key") as caught:
-        gateway_with(tmp_path, free_tls_endpoint()).open()
-    assert str(tmp_path) in str(caught.value)
-    assert "`acsard tls renew`" in str(caught.value)
-
-
 def test_an_address_in_use_is_not_a_bad_certificate(certificates: Certificates) -> None:
     with socket.create_server(("127.0.0.1", 0)) as other:
         tls = f"tls/127.0.0.1:{other.getsockname()[1]}"
         with pytest.raises(InUseError, match=f"cannot listen on {tls}: .*stop that program"):
             gateway_with(certificates.robot, tls).open()
-
-
-def listening(endpoint: str) -> zenoh.Config:
-    config = zenoh.Config()
-    config.insert_json5("listen/endpoints", f'["{endpoint}"]')
-    config.insert_json5("scouting/multicast/enabled", "false")
-    return config
-
-
-@pytest.mark.parametrize("answers", [True, pytest.param(False, marks=pytest.mark.nightly)])
-def test_a_gateway_ends_if_its_connected_daemon_answers_no_queries(
-    tmp_path: Path, certificates: Certificates, answers: bool
-) -> None:
-    """On a busy machine Zenoh sometimes stops reading from a gateway, although the link stays open.
-
-    The gateway must then end, so that the daemon starts a new one.
-    """
-    plain, tls = free_endpoint(), free_tls_endpoint()
-    bus = {"listen": [plain, tls], "tls": str(certificates.robot)}
-    config = write_config(tmp_path / "a.toml", {"bus": bus})
-    asked: list[zenoh.Query] = []
-
-    def on_query(query: zenoh.Query) -> None:
-        asked.append(query)
-        if answers:
-            query.drop()
-
-    with zenoh.open(listening(plain)) as daemon:
-        daemon.declare_queryable("acsard/acsar/info", on_query)
-        with Program(acsard("gateway", "--config", str(config)), tmp_path) as gateway:
-            until(lambda: len(asked) > MAX_UNANSWERED + 2 * answers, 30.0, f"questions\n{gateway}")
-            if answers:
-                assert gateway.process.poll() is None
-                return
-            assert gateway.ended(10.0) == 1
-            assert "gateway_lost_daemon" in gateway.stdout + gateway.stderr
 
 
 def test_a_gateway_ends_in_order_if_its_daemon_ended_without_reading_signs_of_life(

@@ -7,10 +7,7 @@ and a few lines of code replace the storage plugin. `test_access.py` tries the p
 from __future__ import annotations
 
 import json
-import signal
-import time
 from collections.abc import Iterator
-from functools import partial
 from pathlib import Path
 
 import pytest
@@ -22,11 +19,10 @@ from acsard.core.config.parsing import parse
 from acsard.core.messages.json_schema import SCHEMAS
 from acsard.core.messages.keys_and_roles import SERVICES, TOPICS, WHOAMI, source_keys, whoami_key
 from acsard.core.values import ROLES
-from acsard.host.errors import Exit
 from tests.permissions import FORGED, SOURCES, TWIST
 from tests.promised import PUBLISHED
-from tests.system.fleet_router import ROBOT_FILE, ROBOTS, Fleet, for_two, robot_at
-from tests.system.harness import Bus, acsard, finish, until
+from tests.system.fleet_router import ROBOT_FILE, ROBOTS, Fleet, for_two
+from tests.system.harness import Bus, until
 
 pytestmark = pytest.mark.network
 
@@ -39,68 +35,19 @@ def fleet(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Fleet]:
         yield fleet
 
 
-def test_an_operator_drives_one_robot_and_a_viewer_stops_it(fleet: Fleet) -> None:
-    first, two = fleet.robots
-    with (
-        fleet.member("operator") as operator,
-        fleet.member("viewer") as viewer,
-        viewer.follow("state") as states,
-        operator.commanding(0.3, certificate="operator"),
-    ):
-        states.find(lambda state: (state["linear"] or 0.0) > 0.1, 3.0, "robot1 drives")
-        assert not any(two.state()["wheels"])
-        viewer.put("stop", True)
-        states.find(lambda state: state["mode"] == "stopped", 1.0, "the viewer stopped it")
-        assert not viewer.ask("srv/clear")
-        assert operator.get("srv/clear")["success"]
-    first.at_rest()
-
-
-def test_a_stop_that_a_stalled_robot_reads_after_more_than_two_seconds_stops_it(
+def test_the_python_client_drives_through_the_router_under_its_certificate_s_name(
     fleet: Fleet,
 ) -> None:
-    with fleet.member("viewer") as viewer, fleet.member("maintainer") as maintainer:
-        until(lambda: viewer.ask("info"), 5.0, "the viewer reaches the robot")
-        robot = fleet.daemons[0]
-        robot.signal(signal.SIGSTOP)
-        try:
-            viewer.put("stop", True)
-            time.sleep(4.0)
-        finally:
-            robot.signal(signal.SIGCONT)
-
-        def stopped() -> bool:
-            return any(b'"mode":"stopped"' in answer.payload for answer in maintainer.ask("state"))
-
-        until(stopped, 5.0, "the stop arrives")
-        assert maintainer.get("srv/clear")["success"]
-
-
-@pytest.mark.parametrize("name", ["operator", "robot1"])
-def test_the_python_client_drives_through_the_router_under_its_certificate_s_name(
-    fleet: Fleet, name: str
-) -> None:
-    tls = str(fleet.where / name)
+    tls = str(fleet.where / "operator")
     with (
         fleet.member("viewer") as viewer,
         viewer.follow("state") as states,
         connect(fleet.endpoint, robot_id="robot1", tls=tls) as robot,
     ):
         robot.drive(0.2, seconds=0.3)
-        driven = {
-            entry.value["sender"] for entry in states.seen if (entry.value["linear"] or 0.0) > 0.1
-        }
+        driven = {e.value["sender"] for e in states.seen if e.value["mode"] == "driving"} - {""}
         assert driven == {robot._connection.sender}
-        assert robot._connection.sender.endswith(f" [{name}]")
-
-
-def test_all_robots_are_seen_each_by_its_own_keys(fleet: Fleet) -> None:
-    with fleet.member("viewer") as viewer:
-        for root in (ONE, TWO):
-            state = f"{root}/state"
-            assert [str(r.ok.key_expr) for r in viewer.session.get(state) if r.ok] == [state]
-            tokens = viewer.session.liveliness().get(f"{root}/alive", timeout=5.0)
-            assert [str(r.ok.key_expr) for r in tokens if r.ok] == [f"{root}/alive"]
+        assert robot._connection.sender.endswith(" [operator]")
 
 
 def test_a_robots_certificate_serves_its_own_tree_only(fleet: Fleet) -> None:
@@ -150,26 +97,6 @@ def test_on_a_robot_that_is_a_peer_programs_need_no_router_and_reach_no_other_ro
         first.comes_to("ready")
         assert first.count("commands") == before
     two.at_rest()
-
-
-def test_each_robot_reports_that_its_router_was_found(fleet: Fleet) -> None:
-    for daemon in fleet.daemons:
-        until(partial(daemon.events, "router_found"), 5.0, "the router is reported")
-        assert daemon.events("router_missing") == []
-
-
-def test_a_second_robot_with_the_same_id_ends_with_75(fleet: Fleet) -> None:
-    with robot_at(fleet.endpoint, fleet.where, "robot1", name="twin", ready=False) as twin:
-        assert twin.ended(10.0) == Exit.IN_USE
-    assert "already has the id robot1" in twin.stderr
-    assert fleet.robots[0].state()["link"] == "up"
-
-
-def test_the_tools_join_as_the_manual_says(fleet: Fleet) -> None:
-    where = ["--id", "robot1", "--connect", fleet.endpoint, "--tls", str(fleet.where / "viewer")]
-    echo = finish(acsard("echo", "state", "-n", "1", *where), fleet.where)
-    assert echo.code == 0, echo
-    assert json.loads(echo.out)["mode"] == "ready"
 
 
 # the files
