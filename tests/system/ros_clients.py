@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import json
 import os
-import socket
 import struct
 import subprocess
 import threading
@@ -833,54 +832,3 @@ class Sdk(Program):
         stdin.flush()
         line = self.says(f"answer {self._number} ")
         return json.loads(line.split(" ", 2)[2])
-
-
-# networks
-
-
-class Relay:
-    """A TCP relay between a client and `target` that counts the bytes of the replies."""
-
-    def __init__(self, target: str) -> None:
-        self.came = 0
-        self._target = _address(target)
-        self._server = socket.create_server(("127.0.0.1", 0))
-        self.endpoint = f"tcp/127.0.0.1:{self._server.getsockname()[1]}"
-        self._pipes: list[socket.socket] = []
-
-    def __enter__(self) -> Relay:
-        threading.Thread(target=self._accept, daemon=True).start()
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        for end in (self._server, *self._pipes):
-            try:
-                end.shutdown(socket.SHUT_RDWR)
-            except OSError:
-                pass  # the other end closed first
-            end.close()
-
-    def _accept(self) -> None:
-        while True:
-            try:
-                near = self._server.accept()[0]
-            except OSError:
-                return
-            far = socket.create_connection(self._target)
-            self._pipes += [near, far]
-            for ends in ((near, far, False), (far, near, True)):
-                threading.Thread(target=self._pump, args=ends, daemon=True).start()
-
-    def _pump(self, source: socket.socket, sink: socket.socket, counts: bool) -> None:
-        try:
-            while data := source.recv(65536):
-                if counts:
-                    self.came += len(data)
-                sink.sendall(data)
-        except OSError:
-            pass  # one of the ends has closed
-
-
-def _address(endpoint: str) -> tuple[str, int]:
-    host, _, port = endpoint.removeprefix("tcp/").rpartition(":")
-    return host, int(port)

@@ -38,28 +38,6 @@ session.close()
 )
 """Waits for the daemon, then for its first odometry; prints the time of its arrival."""
 
-DRIVE = (
-    _OPEN
-    + """
-session = open_session(sys.argv[1])
-speed, seconds = float(sys.argv[2]), float(sys.argv[3])
-
-def put(linear):
-    wish = json.dumps({"linear": {"x": linear}, "angular": {"z": 0}})
-    session.put("acsard/acsar/cmd/app", wish, attachment=SENDER)
-
-put(0.0)
-time.sleep(0.05)
-start = time.monotonic()
-for step in range(round(20 * seconds)):
-    put(speed)
-    time.sleep(max(0.0, start + (step + 1) / 20 - time.monotonic()))
-put(0.0)
-print("took", time.monotonic() - start, flush=True)
-session.close()
-"""
-)
-"""Sends one zero, `speed` m/s at 20 Hz for `seconds`, then one zero."""
 
 STUCK = (
     _OPEN

@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import cmath
 import json
-import math
-import signal
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -16,10 +13,7 @@ import pytest
 import zenoh
 
 from acsard.bus.zenoh_sessions import client_session
-from acsard.calibration import drive as driving
 from acsard.calibration.drive import Sensor, place_and_yaw
-from acsard.calibration.log import LogError
-from acsard.core.config.parsing import parse
 from acsard.core.messages.encodings import FORMATS, encode
 from acsard.core.messages.schema import Odometry, PoseStamped
 from acsard.host.errors import Exit
@@ -124,117 +118,9 @@ def ends(terminal: Terminal, program: Program, starts: int) -> None:
     assert program.ended(5.0) == 1, terminal.screen
 
 
-LINE_M, LENGTH_M, WIDTH_M = 0.45, 0.25, 0.30
-"""m from the robot's middle at the start to the line on its left, its wheelbase, its width.
-"""
-
-
-class Person:
-    """Answers what a person measures, from the robot's true pose.
-
-    Nobody can put the simulated robot back after a disturbed leg, so the floor moves instead.
-    """
-
-    def __init__(self, bus: Bus) -> None:
-        self._bus, self._floor, self._begun = bus, (0j, 0.0), (0j, 0.0)
-
-    def _simulated(self) -> tuple[complex, float]:
-        pose = self._bus.get("sim/pose")["pose"]
-        where, turn = pose["position"], pose["orientation"]
-        return complex(where["x"], where["y"]), 2 * math.atan2(turn["z"], turn["w"])
-
-    def pose(self) -> tuple[complex, float]:
-        """Return where the robot stands on the floor, and where it faces."""
-        (place, yaw), (origin, turned) = self._simulated(), self._floor
-        return (place - origin) * cmath.exp(-1j * turned), math.remainder(yaw - turned, math.tau)
-
-    def starts(self, words: str) -> None:
-        if "was disturbed" in words:
-            self._bus.stands()
-            (place, yaw), (begun, faced) = self._simulated(), self._begun
-            self._floor = place - begun * cmath.exp(1j * (yaw - faced)), yaw - faced
-        self._begun = self.pose()
-
-    def measures(self, words: str) -> str:
-        """Return the number for this question, in mm, or in m for the long distance."""
-        place, yaw = self.pose()
-        if "apart" in words:
-            return f"{1000 * LENGTH_M:.0f}"
-        if "from its mark" in words:
-            return f"{abs(place):.3f}"
-        ahead = LENGTH_M / 2 if "front" in words else -LENGTH_M / 2
-        left = place.imag + ahead * math.sin(yaw) + WIDTH_M / 2 * math.cos(yaw)
-        return f"{1000 * (LINE_M - left):.0f}"
-
-
-ENDED = "ended"
-
-
 def screen_text(terminal: Terminal) -> str:
     """Return the whole screen as one line."""
     return " ".join(terminal.screen.split())
-
-
-def goes_through(daemon: Daemon, bus: Bus, *words: str) -> str:
-    """Do a whole calibration, answer each question, and return the output."""
-    person, offset = Person(bus), 0
-    with calibrating(daemon, *words) as (terminal, program):
-
-        def asked() -> str | None:
-            shown = screen_text(terminal)[offset:]
-            if shown.endswith((" mm:", " m:", "q quits.")):
-                return shown
-            return ENDED if program.process.poll() is not None else None
-
-        def faces(least: float, most: float) -> bool:
-            return asked() is not None or least < abs(person.pose()[1]) < most
-
-        while (shown := until(asked, RIDES_S, "a question")) != ENDED:
-            offset = len(screen_text(terminal))
-            if STARTS not in shown:
-                terminal.press(person.measures(shown) + "\n")
-                continue
-            person.starts(shown)
-            terminal.press("\n")
-            if "SPACE" in shown:
-                until(lambda: faces(2.5, 4.0), RIDES_S, "half round")
-                until(lambda: faces(-1.0, 0.15), RIDES_S, "once round")
-                if not asked():
-                    terminal.press(" ")
-        assert program.ended(5.0) == 0, terminal.screen
-    return program.stdout
-
-
-@pytest.mark.soak
-@pytest.mark.timeout(300)
-def test_a_person_with_a_gyro_is_guided_from_the_start_to_the_written_file(tmp_path: Path) -> None:
-    with running(tmp_path, config=SKIDDING) as (daemon, bus):
-        results = json.loads(goes_through(daemon, bus, "--write", "--json"))
-        written = parse(daemon.config.read_bytes())
-    print(
-        f"turn: {results['turn_error']['now']:.0f} -> {results['turn_error']['new']:.1f} deg in 360"
-    )
-    assert results["turn_error"]["new"] < results["turn_error"]["now"] / 10
-    found = results["found"]
-    assert abs(found["wheel_separation_multiplier"] - 1.6) < 0.05
-    assert found["left_wheel_radius_multiplier"] == pytest.approx(1.0, abs=0.01)
-    drive = written.drive
-    assert drive.wheel_separation_multiplier == pytest.approx(
-        found["wheel_separation_multiplier"], abs=1e-4
-    )
-    assert written.odometry.wheel_separation_multiplier_std > 0
-
-
-@pytest.mark.soak
-@pytest.mark.timeout(300)
-def test_a_person_with_a_tape_alone_is_guided_to_the_written_file(tmp_path: Path) -> None:
-    with running(tmp_path, config=SKIDDING) as (daemon, bus):
-        output = goes_through(daemon, bus, "--method", "tape", "--write")
-        written = parse(daemon.config.read_bytes()).drive
-    assert "New track and radii are better" in output
-    assert abs(written.wheel_separation_multiplier - 1.6) < 0.05
-    assert written.left_wheel_radius_multiplier == pytest.approx(1.0, abs=0.006)
-    assert written.right_wheel_radius_multiplier == pytest.approx(1.0, abs=0.006)
 
 
 @pytest.mark.slow
@@ -307,29 +193,6 @@ def test_the_simulator_is_calibrated_by_its_true_pose_without_a_person(tmp_path:
     assert results["found"]["left_wheel_radius_multiplier"] == pytest.approx(1.0, abs=0.002)
 
 
-@pytest.mark.soak
-@pytest.mark.timeout(300)
-@pytest.mark.parametrize("stalled", ["calibration", "daemon"])
-def test_on_the_simulator_a_process_suspended_for_1_5_s_does_not_end_the_calibration(
-    tmp_path: Path, stalled: str
-) -> None:
-    with running(tmp_path, config=SKIDDING) as (daemon, bus):
-        words = ["calibrate", "drive", "--poses", "sim/pose", "--yes", "--json"]
-        with Program(acsard(*words, "--config", str(daemon.config)), tmp_path) as program:
-            until(lambda: (bus.state()["linear"] or 0.0) > 0.25, 20.0, "the first leg moves")
-            process = program.process if stalled == "calibration" else daemon.process
-            process.send_signal(signal.SIGSTOP)
-            time.sleep(1.5)
-            process.send_signal(signal.SIGCONT)
-            assert program.ended(2 * RIDES_S) == 0, program.stderr
-        assert "was disturbed" in program.stderr
-        assert "Put the robot back" not in program.stderr
-        if stalled == "calibration":
-            assert "this computer did not run the calibration for 1." in program.stderr
-        results = json.loads(program.stdout)
-    assert abs(results["found"]["wheel_separation_multiplier"] - 1.6) < 0.05
-
-
 POSE = {
     "position": {"x": 1.5, "y": -2.0, "z": 0.0},
     "orientation": {"x": 0, "y": 0, "z": 0, "w": 1},
@@ -361,23 +224,6 @@ def test_poses_of_another_program_are_received_as_both_types_in_every_encoding(f
 
 def poses(receiver: zenoh.Session, key: str) -> Sensor:
     return Sensor(receiver, key, (Odometry, PoseStamped), place_and_yaw, ("x", "y", "yaw"))
-
-
-def test_poses_that_are_missing_or_of_another_type_are_reported(
-    free: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(driving, "FIRST_STATE_TIMEOUT_S", 0.2)
-    with router(free) as sender, client_session(free, "") as receiver:
-        sensor = poses(receiver, "slam/pose")
-        with pytest.raises(LogError, match="does not arrive on the Zenoh key slam/pose"):
-            sensor.await_first("a pose")
-
-        def came() -> int:
-            sender.put("slam/pose", b'{"x": 1}')
-            return sensor.receive(0.0)
-
-        with pytest.raises(LogError, match="cannot be read"):
-            until(came, 5.0, "a sample")
 
 
 @pytest.mark.slow

@@ -2,22 +2,16 @@
 
 from __future__ import annotations
 
-import json
 import os
 import pty
-import re
-import shutil
 import signal
 import subprocess
-import sys
 import tomllib
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import Any
 
 import pytest
 
-from tests.system.harness import ROOT, Bus, Daemon, Program, acsard, finish, until
+from tests.system.harness import Bus, Daemon, Program, acsard, until
 from tests.system.terminals import Terminal, at_terminal
 from tests.system.typed import typed
 
@@ -27,11 +21,6 @@ CHECK_S = 200.0
 The limit is for a machine that is busy with other work, on which the check repeats the measurements
 that this spoilt.
 """
-
-BESIDE = 6
-"""Number of parallel checks that leave the cores of a small machine enough time for each."""
-
-WHEELS = ("fr", "fl", "rl", "rr")
 
 
 def test_a_port_that_the_daemon_holds_ends_with_75_and_how_to_stop_it(
@@ -63,18 +52,6 @@ def test_a_running_daemon_lends_its_port_and_gets_it_back(tmp_path: Path) -> Non
             assert ended.code == 1
             assert bus.state()["mode"] == "stopped"
             until(lambda: len(daemon.events("port_open")) == 3, 5.0, "the port is open again")
-
-
-def test_a_port_that_is_not_there_ends_with_66() -> None:
-    ended = typed("mcu", "check", "--port", "/dev/acsar_none", "--yes")
-    assert ended.code == 66
-    assert "acsard ports" in ended.err
-
-
-def test_mcu_check_without_a_terminal_ends_with_2() -> None:
-    ended = typed("mcu", "check", "--port", "sim")
-    assert (ended.code, ended.out) == (2, "")
-    assert "terminal" in ended.err
 
 
 def test_yes_alone_is_refused_on_a_pty_that_is_not_the_simulator_s() -> None:
@@ -142,105 +119,10 @@ def test_q_without_enter_ends_mcu_check_while_a_motor_turns(tmp_path: Path) -> N
 
 # on ptys, in real time
 
-FAULTS: dict[str, tuple[str, list[str], dict[str, object]]] = {
-    "good": ("", [], {}),
-    "swapped": ("swapped_encoders=a:d", ["motor a (front right)", "motor d (rear right)"], {}),
-    "reversed": ("reversed_encoder=b", ["motor b (front left)"], {}),
-    "comma": (
-        "comma_latched",
-        ["trailing comma", "watchdog", "damaged lines"],
-        {"mcu.trailing_comma": True},
-    ),
-    "no watchdog": ("no_watchdog", ["watchdog"], {}),
-    "fed watchdog": ("watchdog_fed_by_bad_lines", ["watchdog"], {}),
-    "late watchdog": ("late_watchdog", ["watchdog"], {}),
-    "dead encoder": ("stuck_encoder=c", ["motor c (rear left)"], {}),
-    "baud": ("wrong_baud=57600", ["baud rate"], {"mcu.baud_rate": 57600}),
-    "10 Hz": ("free_running", ["reply rate"], {"mcu.reply_period": 0.1}),
-    "spaces": ("spaces", [], {}),
-    "unpadded": ("unpadded", [], {}),
-}
-
-
-def checked(where: Path, name: str) -> tuple[int, dict[str, Any], str]:
-    """Check one faulty robot; return exit code, answer and the written configuration."""
-    fault = FAULTS[name][0]
-    place = where / name
-    place.mkdir()
-    config = place / "acsard.toml"
-    shutil.copy(ROOT / "acsard.toml", config)
-    words = ["--fault", fault] if fault else []
-    with Program(acsard("sim", *words), place) as sim:
-        port = sim.says("acsard run --port").split()[-1]
-        check = acsard("mcu", "check", "--port", port, "--yes", "--json", "--write")
-        ended = finish(check, place, CHECK_S)
-    assert ended.err == ""
-    return ended.code, json.loads(ended.out), config.read_text()
-
-
-@pytest.mark.soak
-@pytest.mark.network
-@pytest.mark.timeout(3 * CHECK_S)
-def test_each_planted_fault_is_found_on_a_pty_and_a_good_board_passes(tmp_path: Path) -> None:
-    """The check finds the fault, or does not judge it because this machine was late.
-
-    A test in virtual time shows that this is the only reason for not judging it.
-    """
-    with ThreadPoolExecutor(BESIDE) as pool:
-        results = dict(zip(FAULTS, pool.map(lambda n: checked(tmp_path, n), FAULTS), strict=True))
-    for name, (_, failed, changes) in FAULTS.items():
-        code, report, text = results[name]
-        named = [finding["name"] for finding in report["findings"] if finding["verdict"] == "FAIL"]
-        late = any(finding["figure"] == "not judged" for finding in report["findings"])
-        assert named == failed or (late and set(named) <= set(failed)), (name, report)
-        assert code == (1 if named or late else 0)
-        assert late or changes.items() <= report["changes"].items(), name
-        if name in ("spaces", "unpadded"):
-            form = next(
-                finding for finding in report["findings"] if finding["name"] == "reply form"
-            )
-            assert (form["verdict"], form["figure"]) == ("WARN", name)
-        # Every line of the reference is still there, apart from the values of the keys that
-        # changed.
-        reference = (ROOT / "acsard.toml").read_text().splitlines()
-        pairs = zip(reference, text.splitlines(), strict=True)
-        differing = [after for before, after in pairs if before != after]
-        assert sorted(re.split(" =", line)[0] for line in differing) == sorted(
-            key.rpartition(".")[2] for key in report["changes"]
-        )
-
-
-BUSY = "while True: pass"
-
-
-@pytest.mark.soak
-@pytest.mark.timeout(600)
-@pytest.mark.parametrize("loops", [0, 4])
-def test_a_busy_computer_finds_no_fault_of_a_good_board(tmp_path: Path, loops: int) -> None:
-    """Run five checks at once, or one beside busy loops. They blame only this computer."""
-    spinning = [subprocess.Popen([sys.executable, "-c", BUSY]) for _ in range(loops)]
-    places = [tmp_path / str(n) for n in range(1 if loops else 5)]
-    for place in places:
-        place.mkdir()
-    try:
-        with ThreadPoolExecutor(len(places)) as pool:
-            results = list(pool.map(lambda place: checked(place, "good"), places))
-    finally:
-        for item in spinning:
-            item.kill()
-            item.wait()
-    for code, report, _ in results:
-        problems = [item for item in report["findings"] if item["verdict"] in ("FAIL", "WARN")]
-        print(*problems, sep="\n")
-        assert code == (1 if problems else 0), report
-        assert all("this computer ran the check" in item["text"] for item in problems), report
-        assert report["changes"].keys() <= {"mcu.port", "mcu.link_check", "mcu.encoder_counts"}
-        assert report["changes"].get("mcu.encoder_counts", 3200) == 3200
-
 
 @pytest.mark.network
 @pytest.mark.parametrize(
-    "number", [pytest.param(signal.SIGTERM, marks=pytest.mark.soak), signal.SIGINT]
+    "number", [pytest.param(signal.SIGTERM, marks=pytest.mark.nightly), signal.SIGINT]
 )
 def test_a_signal_while_a_wheel_turns_ends_in_zeros(tmp_path: Path, number: signal.Signals) -> None:
     with Program(acsard("sim", "--fault", "no_watchdog"), tmp_path) as sim:
@@ -259,17 +141,6 @@ def test_a_signal_while_a_wheel_turns_ends_in_zeros(tmp_path: Path, number: sign
         words = acsard("mcu", "check", "--port", port, "--yes")
         with Program(words, tmp_path) as again:
             again.says("PASS    motor a", 30.0)
-
-
-@pytest.mark.network
-@pytest.mark.nightly
-def test_a_person_at_a_real_port_is_asked_after_each_motor(tmp_path: Path) -> None:
-    with Program(acsard("sim", "--fault", "reversed_wheel=c"), tmp_path) as sim:
-        port = sim.says("acsard run --port").split()[-1]
-        with at_terminal(tmp_path, "mcu", "check", "--port", port) as (terminal, program):
-            answer_all(terminal, WHEELS, "ffbf", 20.0)
-            assert program.ended(CHECK_S) == 1
-            until(lambda: 'rear_left = "-c"' in terminal.screen, 5.0, "the line")
 
 
 @pytest.mark.network

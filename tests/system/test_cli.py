@@ -8,12 +8,10 @@ import os
 import re
 import signal
 import time
-import tomllib
 from pathlib import Path
 
 import pytest
 
-from acsard.bus.robot_discovery import Presence, presence
 from acsard.client import connect
 from acsard.host.errors import Exit
 from tests.scenarios.taped import Tape
@@ -52,105 +50,6 @@ def test_without_a_verb_the_daemon_runs_with_the_options_and_the_local_acsard_to
         assert daemon.ended(3.0) == 0
 
 
-# topics and check need no daemon
-
-
-def test_check_prints_a_toml_document_that_checks_again(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    ended = typed("check")
-    assert (ended.code, ended.err) == (0, "")
-    assert ended.out.startswith("# effective configuration from built-in defaults")
-    assert tomllib.loads(ended.out)["drive"]["wheel_radius"] == 0.05
-    (tmp_path / "again.toml").write_text(ended.out)
-    again = typed("check", "--config", str(tmp_path / "again.toml"))
-    assert again.code == 0
-    assert again.out.splitlines()[1:] == ended.out.splitlines()[1:]
-
-
-def test_check_json_is_the_configuration_in_force(shared: Daemon, bus: Bus) -> None:
-    ended = tool(shared, "check", "--json")
-    assert ended.code == 0
-    assert json.loads(ended.out) == bus.get("config")
-
-
-# echo
-
-
-def test_echo_tf_static_prints_the_latched_message_without_waiting_for_the_next(
-    shared: Daemon, bus: Bus
-) -> None:
-    begun = time.monotonic()
-    ended = tool(shared, "echo", "tf_static", "-n", "1")
-    assert ended.code == 0
-    assert json.loads(ended.out)["transforms"][0]["child_frame_id"] == "lidar_link"
-    assert ended.seconds < 4.0 + lost(begun)
-
-
-@pytest.mark.slow
-def test_echo_shows_commands_of_other_programs_also_if_they_are_malformed(
-    shared: Daemon, bus: Bus
-) -> None:
-    words = acsard("echo", "cmd/stranger", "-n", "2", "--config", str(shared.config))
-    with Program(words, shared.config.parent) as echo:
-        for payload in (b'{"linear": {}, "angular": {}}', b"\xff"):
-            before = len(echo.out)
-
-            def shown(payload: bytes = payload, before: int = before) -> bool:
-                bus.session.put("acsard/acsar/cmd/stranger", payload)
-                return len(echo.out) > before or echo.process.poll() is not None
-
-            until(shown, 5.0, "the command at echo")
-        assert echo.ended(5.0) == 0
-    assert json.loads(echo.out[0]) == {"linear": {}, "angular": {}}
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("words", "why"),
-    [
-        (
-            ["echo", "state", "--short", "--id", "acsra"],
-            "there is no robot acsra. Robots here: acsar",
-        ),
-        (
-            ["echo", "odom", "--rate", "--id", "acsra"],
-            "there is no robot acsra. Robots here: acsar",
-        ),
-        (["echo", "cmd/nobody"], "but no program sends on the Zenoh key cmd/nobody now"),
-    ],
-)
-@pytest.mark.nightly
-def test_a_tool_that_waits_for_a_message_prints_the_reason_once_and_goes_on_waiting(
-    shared: Daemon, bus: Bus, words: list[str], why: str
-) -> None:
-    typed = acsard(*words, "--config", str(shared.config))
-    with Program(typed, shared.config.parent) as waiting:
-        until(lambda: why in waiting.stderr, 10.0, "why nothing comes")
-        assert waiting.process.poll() is None
-        waiting.signal(signal.SIGINT)
-        assert waiting.ended(5.0) == 0
-    (line,) = waiting.stderr.splitlines()
-    key = "state" if "state" in words else words[1]
-    assert line.startswith("acsard: waiting for messages on acsard/acs")
-    assert f"/{key}: " in line
-
-
-@pytest.mark.slow
-def test_a_waiting_client_notices_that_the_daemon_has_ended(tmp_path: Path) -> None:
-    with Daemon(tmp_path) as daemon, connect(daemon.endpoint) as client:
-        robot = client._connection
-
-        def seen() -> Presence | None:
-            return presence(robot.session, "acsar", daemon.endpoint)
-
-        assert seen() == Presence(linked=True, here=True)
-        daemon.signal(signal.SIGINT)
-        daemon.ended(5.0)
-        until(lambda: seen() == Presence(linked=False, here=False), 5.0, "that it is gone")
-
-
 def test_echo_into_a_reader_that_leaves_ends_quietly(shared: Daemon, bus: Bus) -> None:
     script = '{ "$@"; echo "code $?" >&2; } | head -n 1'
     echo = acsard("echo", "odom", "--config", str(shared.config))
@@ -172,21 +71,6 @@ def test_printing_to_a_reader_that_has_left_ends_quietly(tmp_path: Path, words: 
     assert p.stderr == ""
 
 
-def test_a_failure_keeps_its_exit_code_when_the_reader_of_the_output_has_left(
-    shared: Daemon,
-) -> None:
-    env = {key: value for key, value in environment().items() if key != "PYTHONUNBUFFERED"}
-    reader, writer = os.pipe()
-    os.close(reader)
-    words = acsard("get", "info", "--id", "acsar,other", "--config", str(shared.config))
-    with (
-        os.fdopen(writer, "wb") as closed,
-        Program(words, shared.config.parent, env, stdout=closed) as get,
-    ):
-        assert get.ended(10.0) == Exit.UNREACHABLE
-    assert "Traceback" not in get.stderr
-
-
 @pytest.mark.slow
 def test_a_replay_fails_if_the_reader_of_its_output_has_left(tmp_path: Path) -> None:
     env = {key: value for key, value in environment().items() if key != "PYTHONUNBUFFERED"}
@@ -200,13 +84,6 @@ def test_a_replay_fails_if_the_reader_of_its_output_has_left(tmp_path: Path) -> 
     with os.fdopen(writer, "wb") as closed, Program(words, tmp_path, env, stdout=closed) as replay:
         assert replay.ended(10.0) == Exit.FAILURE
     assert replay.stderr == ""
-
-
-def test_a_judging_command_fails_if_the_reader_of_its_output_leaves(tmp_path: Path) -> None:
-    script = '{ "$@"; echo "code $?" >&2; } | head -n 1'
-    words = acsard("mcu", "check", "--port", "sim", "--yes")
-    ended = finish(["sh", "-c", script, "sh", *words], tmp_path, 30.0)
-    assert ended.err.splitlines()[-1] == "code 1"
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
@@ -232,15 +109,6 @@ def test_echo_measures_a_hundred_messages_per_second(shared: Daemon, bus: Bus) -
     # Measured over a second. A message that comes late at one end may also have come late at the
     # other.
     assert float(second[0]) == pytest.approx(100.0, abs=3.0 + 100.0 * late)
-
-
-# names that do not exist
-
-
-# call
-
-
-# set
 
 
 @pytest.mark.slow
@@ -285,19 +153,6 @@ def test_a_separate_simulator_process_is_driven_through_the_printed_port(tmp_pat
 
 
 @pytest.mark.slow
-def test_a_faulty_simulator_misbehaves_and_says_so(tmp_path: Path) -> None:
-    with Program(acsard("sim", "--fault", "mute"), tmp_path) as sim:
-        port = sim.says("acsard run --port").split()[-1]
-        assert port.startswith("/dev/pts/")
-        with Daemon(tmp_path, port) as daemon, Bus(daemon.endpoint) as bus:
-            until(lambda: bus.count("lines_sent") > 5, 5.0, "lines to the mute one")
-            state = bus.state()
-            assert (state["link"], state["mode"]) == ("booting", "waiting")
-            assert state["counters"]["lines"] == 0
-    assert "faults: mute" in sim.stderr
-
-
-@pytest.mark.slow
 def test_a_simulator_does_not_remove_the_link_of_the_one_that_replaced_it(tmp_path: Path) -> None:
     link = tmp_path / "mcu"
     with Program(acsard("sim", "--link", "mcu"), tmp_path) as first:
@@ -312,9 +167,6 @@ def test_a_simulator_does_not_remove_the_link_of_the_one_that_replaced_it(tmp_pa
             second.signal(signal.SIGINT)
             assert second.ended(3.0) == 0
     assert not link.is_symlink()
-
-
-# move
 
 
 @pytest.mark.slow

@@ -16,7 +16,6 @@ from contextlib import contextmanager
 import pytest
 
 from acsard.client import connect
-from tests.system.bystander import lost
 from tests.system.harness import (
     Bus,
     Daemon,
@@ -114,31 +113,6 @@ def test_a_terminal_closed_under_a_shell_stops_its_drive_by_a_zero_not_by_silenc
 
 
 @pytest.mark.slow
-def test_a_held_key_drives_and_its_release_stops_the_robot(shared: Daemon, bus: Bus) -> None:
-    with driving(shared) as (terminal, program):
-        with key_held(terminal, "i"):
-            until(lambda: bus.state()["linear"] == pytest.approx(0.5, abs=0.01), 5.0, "0.5 m/s")
-            assert bus.state()["source"] == "teleop"
-        released = time.monotonic()
-        bus.at_rest()
-        took = time.monotonic() - released
-        print(f"key let go -> at rest: {took:.2f} s")
-        # 0.6 s of hold, 0.5 s of ramp, and a part of the way.
-        assert 0.6 < took < 1.5 + 0.3 + lost(released, released + took)
-        assert program.process.poll() is None
-
-
-@pytest.mark.slow
-def test_speed_keys_change_the_speed_of_the_next_key(shared: Daemon, bus: Bus) -> None:
-    with driving(shared, "--linear", "0.2") as (terminal, _):
-        terminal.press("w")
-        until(lambda: "0.22 m/s" in terminal.screen, 3.0, "the new speed on the screen")
-        with key_held(terminal, "i"):
-            until(lambda: bus.state()["linear"] == pytest.approx(0.22, abs=0.005), 5.0, "0.22 m/s")
-    bus.at_rest()
-
-
-@pytest.mark.slow
 def test_ctrl_c_while_driving_stops_and_leaves_with_0_and_the_terminal_as_it_was(
     shared: Daemon, bus: Bus
 ) -> None:
@@ -159,37 +133,6 @@ def test_ctrl_c_while_driving_stops_and_leaves_with_0_and_the_terminal_as_it_was
     assert during != after
     with Terminal() as fresh:
         assert after == fresh.settings
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
-def test_a_drive_that_is_ended_from_outside_leaves_the_terminal_as_it_was(
-    shared: Daemon, bus: Bus, number: signal.Signals
-) -> None:
-    with driving(shared) as (terminal, program):
-        program.signal(number)
-        program.ended(3.0)
-        after = terminal.settings
-    with Terminal() as fresh:
-        assert after == fresh.settings
-
-
-@pytest.mark.slow
-def test_a_stranger_s_put_on_the_robot_s_topics_does_not_end_a_drive(
-    shared: Daemon, bus: Bus
-) -> None:
-    with driving(shared) as (terminal, program):
-        for payload in (b"\xff", b"{}", b""):
-            for name in ("state", "odom", "cmd_vel_out", "events", "beat"):
-                bus.session.put(f"acsard/*/{name}", payload)
-        with key_held(terminal, "i"):
-            until(
-                lambda: (bus.state()["linear"] or 0.0) > 0.2 or program.process.poll() is not None,
-                5.0,
-                "driving on",
-            )
-        assert program.process.poll() is None, program.stderr
-    bus.at_rest()
 
 
 def test_drive_at_a_terminal_without_a_screen_ends_with_2(shared: Daemon) -> None:

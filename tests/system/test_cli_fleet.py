@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import json
-import os
 import re
 import signal
-import urllib.request
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager, redirect_stdout, suppress
+from contextlib import ExitStack, contextmanager
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -17,13 +15,8 @@ import pytest
 import zenoh
 
 from acsard.bus.robot_discovery import ALL_ROBOTS, stop
-from acsard.cli import main
-from acsard.client import connection
 from acsard.host.version import version
-from acsard.machine.authority import Authority
 from tests.pages import blocks
-from tests.system.browser import Page
-from tests.system.fleet_router import certified, robot_at, router
 from tests.system.harness import (
     Bus,
     Daemon,
@@ -35,9 +28,7 @@ from tests.system.harness import (
     free_endpoint,
     until,
 )
-from tests.system.identities import free_tls_endpoint
 from tests.system.terminals import SCREEN, at_terminal, screens
-from tests.system.test_recording_disks import disk
 from tests.system.typed import typed
 
 pytestmark = pytest.mark.slow  # each starts two robots and a router
@@ -167,15 +158,6 @@ def test_a_stranger_s_answer_hides_no_robot_and_sends_no_control_codes_to_the_te
     robots.tool("call", "clear", who=TWO)
 
 
-@pytest.mark.slow
-def test_a_robot_that_does_not_answer_hides_no_other_robot(robots: Robots) -> None:
-    with fake(robots, None):
-        ended = robots.tool("get", "info")
-    assert ended.code == 69
-    assert [json.loads(line)["robot"] for line in ended.out.splitlines()] == [ONE, TWO]
-    assert ended.err.startswith("fake: NO ANSWER")
-
-
 def test_a_stop_to_all_reaches_each_robot_without_discovery(robots: Robots) -> None:
     with zenoh.open(client_config(robots.endpoint)) as session:
         stop(session, [ALL_ROBOTS], "me")
@@ -184,31 +166,6 @@ def test_a_stop_to_all_reaches_each_robot_without_discovery(robots: Robots) -> N
                 until(lambda: bus.state()["mode"] == "stopped", 5.0, "stopped")
     for name in (ONE, TWO):
         robots.tool("call", "clear", who=name)
-
-
-def test_a_table_for_a_pipe_does_not_wait_for_the_connection_to_be_closed(
-    robots: Robots, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    near, far = os.pipe()
-    os.set_blocking(near, False)
-    chunks = [b""]
-    really = connection.close
-
-    def close(session: zenoh.Session) -> None:
-        with suppress(BlockingIOError):
-            chunks.append(os.read(near, 65536))
-        really(session)
-
-    monkeypatch.setattr(connection, "close", close)
-    with os.fdopen(near, "rb"), os.fdopen(far, "w") as pipe, redirect_stdout(pipe):
-        main(robots.command_line("fleet", "--once", who=f"{ONE},{TWO}")[3:])
-    assert b"ready" in chunks[-1]
-
-
-def test_fleet_stops_waiting_when_each_named_robot_has_reported(robots: Robots) -> None:
-    both, missing = (robots.tool("fleet", "--once", who=f"{ONE},{o}") for o in (TWO, "robot9"))
-    assert 1.5 * both.seconds < missing.seconds
-    assert len(re.findall(r"^robot\d +ready .* waiting for a command", both.out, re.M)) == 2
 
 
 @pytest.mark.slow
@@ -237,79 +194,6 @@ def test_fleet_at_a_terminal_is_live_and_says_which_robot_has_gone(robots: Robot
         terminal.press("q")
         assert program.ended(3.0) == 0
     assert "Traceback" not in terminal.screen + program.stderr
-
-
-@pytest.mark.nightly
-@pytest.mark.skipif(os.geteuid() != 0, reason="only root may mount")
-def test_a_full_disk_and_a_certificate_that_ends_do_not_look_ready(tmp_path: Path) -> None:
-    """The table, the page, its metrics and `acsard echo` show both problems to the operator."""
-    endpoint, names = free_endpoint(), ("full", "ends", "sound")
-    Authority.make(tmp_path / "own", "test", 10).issue(tmp_path / "own", "ends", ["localhost"], 10)
-    with ExitStack() as stack:
-        stack.enter_context(zenoh.open(client_config(endpoint, "router")))
-        full = stack.enter_context(disk(tmp_path, "size=256k"))
-        (full / "ballast").write_bytes(bytes(256 * 1024))
-        daemons = {}
-        for name in names:
-            listen, tls = [free_endpoint()], ""
-            if name == "ends":
-                tls = str(tmp_path / "own")
-                listen.append(free_tls_endpoint())
-            own: Tables = {
-                "robot": {"id": name},
-                "bus": {"listen": listen, "connect": [endpoint], "tls": tls},
-                "ros": {"namespace": name},
-            }
-            words = ["--record", str(full / "record")] if name == "full" else []
-            daemon = Daemon(tmp_path, config=own, name=name, words=words)
-            daemons[name] = stack.enter_context(daemon)
-        view = Robots(tmp_path, endpoint, daemons)
-        texts = {
-            "full": "WARNING: recording fails; waiting for a command",
-            "ends": "WARNING: certificate expires in 10 days; waiting for a command",
-            "sound": "waiting for a command",
-        }
-
-        def lines() -> list[str]:
-            return view.tool("fleet", "--once").out.splitlines()[1:]
-
-        def ready() -> bool:
-            return all(
-                re.search(r" ready .*s  (WARNING|waiting for a c)", line) for line in lines()
-            )
-
-        until(lambda: len(lines()) == 3 and ready() and "fails" in lines()[1], 30.0, "each")
-        assert [line.split()[0] for line in lines()] == ["ends", "full", "sound"]
-        for line in lines():
-            assert texts[line.split()[0]] in line
-            assert f" {version()} " in line
-        assert lines()[1].endswith("No space left on device")
-        page = stack.enter_context(Page(daemons["full"], tmp_path, "--connect", endpoint))
-
-        def metrics() -> str:
-            with urllib.request.urlopen(f"{page.here}/metrics") as answer:
-                return str(answer.read().decode())
-
-        until(lambda: 'warning{robot="full",what="recording"} 1' in metrics(), 10.0, "its metric")
-        echoed = view.tool("echo", "state", "-n", "1", "--short", who="full").out
-        assert echoed.rstrip().endswith("WARNING: recording fails")
-
-
-def test_fleet_warns_of_the_robot_whose_settings_differ_from_its_file(robots: Robots) -> None:
-    def table() -> dict[str, str]:
-        out = robots.tool("fleet", "--once", who=f"{ONE},{TWO}").out.splitlines()
-        return {line.split()[0]: line for line in out}
-
-    differ = "rates.odom = 50.0, not 0.0, rates.telemetry = 7.5, not 0.0"
-    assert robots.tool("set", "rates.telemetry", "7.5", "rates.odom", "50", who=ONE).code == 0
-    until(lambda: "WARNING: settings differ" in table()[ONE], 10.0, "the warning")
-    assert differ in table()[ONE]
-    assert "WARNING" not in table()[TWO]
-    ended = robots.tool("fleet", "--json", who=f"{ONE},{TWO}")
-    warnings = {row["robot_id"]: row["state"]["settings_differ"] for row in json.loads(ended.out)}
-    assert (ended.code, warnings) == (0, {ONE: differ, TWO: ""})
-    assert robots.tool("set", "rates.telemetry", "0.0", "rates.odom", "0", who=ONE).code == 0
-    until(lambda: "WARNING" not in table()[ONE], 10.0, "no warning")
 
 
 def stopped_state(bus: Bus) -> bool:
@@ -350,21 +234,6 @@ def test_an_expected_robot_that_hangs_or_is_gone_is_shown_and_ends_with_69(
         assert robots.tool("call", "clear", who=name).code == 0
 
 
-def test_set_ends_with_1_if_one_robot_refuses_and_with_69_if_one_does_not_answer(
-    robots: Robots,
-) -> None:
-    refusal = json.dumps({"success": False, "message": "not now"})
-    with fake(robots, refusal.encode()):
-        ended = robots.tool("set", "rates.telemetry", "0.0", who=f"{ONE},fake")
-    assert ended.code == 1
-    assert re.search(rf"^{ONE}: nothing changed", ended.out, re.M)
-    assert re.search(r"^fake: not now$", ended.out, re.M)
-    ended = robots.tool("set", "rates.telemetry", "0.0", who=f"{ONE},robot9")
-    assert ended.code == 69
-    assert re.search(rf"^{ONE}: nothing changed", ended.out, re.M)
-    assert re.search(r"^robot9: NO ANSWER: ", ended.out, re.M)
-
-
 @pytest.mark.nightly
 @pytest.mark.slow
 def test_the_two_robots_of_the_fleet_page_are_in_one_view(tmp_path: Path) -> None:
@@ -400,26 +269,3 @@ def test_an_empty_network_is_reported_with_69(tmp_path: Path) -> None:
             ended = nobody.tool(*words)
             assert (ended.code, ended.out) == (69, "")
             assert "no robot is visible" in ended.err
-
-
-@pytest.mark.nightly
-@pytest.mark.slow
-@pytest.mark.network
-def test_over_tls_a_wildcard_finds_no_robot_and_says_why_and_named_robots_are_found(
-    tmp_path: Path,
-) -> None:
-    endpoint = free_tls_endpoint()
-    certified(tmp_path, "router.local", ONE, "viewer")
-    with router(tmp_path, endpoint) as program:
-        until(lambda: "routing" in program.stdout, 20.0, "the router")
-        with robot_at(endpoint, tmp_path, ONE, ready=False):
-            viewer = Robots(tmp_path, endpoint, {})
-            by = ("--tls", str(tmp_path / "viewer"))
-            until(lambda: viewer.tool("fleet", "--once", *by, who=ONE).code == 0, 30.0, "the robot")
-            for words in (("fleet", "--once"), ("call", "stop"), ("get", "info")):
-                ended = viewer.tool(*words, *by)
-                assert ended.code == 69
-                assert "Over TLS, name the robots" in ended.err
-            stopped = viewer.tool("call", "stop", *by, who=f"{ONE},{TWO}")
-            assert f"{ONE}: stopped" in stopped.out
-            assert f"{TWO}: NO ANSWER" in stopped.out

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 from collections.abc import Iterator
 from pathlib import Path
@@ -14,7 +13,7 @@ from acsard.core.messages.encodings import encode
 from acsard.core.messages.schema import Header, Imu, Quaternion, Vector3
 from acsard.core.ros.attachments import Attachment
 from acsard.core.ros.names import rmw_key
-from tests.system.harness import Bus, Daemon, Peer, running, seconds, until
+from tests.system.harness import Bus, Daemon, Peer, running, until
 
 SKIDDING: dict[str, dict[str, object]] = {"sim": {"track_multiplier": 1.6}}
 
@@ -43,18 +42,6 @@ def test_the_true_pose_differs_from_odometry_by_the_simulated_track_multiplier(
     assert yaw(skidding.get("sim/pose")["pose"]) == pytest.approx(believed / 1.6, rel=0.02)
 
 
-@pytest.mark.slow
-def test_the_true_pose_is_published_at_100_hz_with_the_stamp_of_each_sample(
-    skidding: Bus,
-) -> None:
-    with skidding.follow("sim/pose") as poses:
-        until(lambda: len(poses.seen) > 50, 5.0, "half a second of looks")
-        stamps = [seconds(sample.value["header"]["stamp"]) for sample in list(poses.seen)]
-    apart = [b - a for a, b in itertools.pairwise(stamps)]
-    assert apart == pytest.approx([0.01] * len(apart), abs=1e-4)
-    assert {sample.value["header"]["frame_id"] for sample in list(poses.seen)} == {"sim"}
-
-
 @pytest.fixture(scope="module")
 def real(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bus]:
     """Provide a client of a daemon on a pty that uses a gyro from the bus."""
@@ -66,11 +53,6 @@ def real(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bus]:
     ):
         bus.linked()
         yield bus
-
-
-def test_a_daemon_on_a_real_port_publishes_no_true_pose(real: Bus) -> None:
-    assert real.ask("sim/pose") == []
-    assert not [row for row in real.get("topics")["topics"] if "sim" in row["key"]]
 
 
 # the gyro
@@ -93,22 +75,6 @@ def test_the_simulated_gyro_corrects_the_odometry_and_is_published_as_imu(tmp_pa
         turned = yaw(bus.get("sim/pose")["pose"]) - true
         assert yaw(bus.get("odom")["pose"]["pose"]) - believed == pytest.approx(turned, rel=0.03)
         assert samples.seen[0].encoding == "application/msgpack;acsard.Imu.v1"
-
-
-@pytest.mark.slow
-def test_a_second_imu_sender_beside_the_simulated_gyro_is_refused_counted_and_logged(
-    tmp_path: Path,
-) -> None:
-    tables: dict[str, dict[str, object]] = {"odometry": {"gyro": True}}
-    with Daemon(tmp_path, config=tables) as daemon, Bus(daemon.endpoint) as bus:
-        bus.linked()
-
-        def counted() -> bool:
-            bus.put("imu", TURNING)
-            return bus.count("imu_second_sender") > 0
-
-        until(counted, 5.0, "the other one is counted")
-        until(lambda: daemon.events("imu_refused") != [], 5.0, "the log has it")
 
 
 TURNING = {"angular_velocity": {"z": 0.0}}
@@ -150,23 +116,3 @@ def test_a_ros_imu_is_received_on_either_transport(real: Bus) -> None:
     until(lambda: real.count("imu_out_of_range") == 1, 5.0, "the bridge's sample is received")
     real.session.put(rmw, encode(sample, "cdr"), attachment=attachment)
     until(lambda: real.count("imu_out_of_range") == 2, 5.0, "rmw_zenoh's sample is received")
-
-
-# faults that the file names
-
-
-@pytest.mark.slow
-def test_a_simulator_that_the_file_makes_mute_never_links_and_the_log_says_why(
-    tmp_path: Path,
-) -> None:
-    with (
-        Daemon(tmp_path, config={"sim": {"faults": ["mute"]}}) as daemon,
-        Bus(daemon.endpoint) as bus,
-        bus.follow("state") as states,
-    ):
-        states.find(lambda state: state["code"] == "received_nothing", 20.0, "no reply")
-        assert bus.get("sim/pose")["header"]["frame_id"] == "sim"
-        assert "up" not in {sample.value["link"] for sample in list(states.seen)}
-        events = daemon.events("configuration")
-    assert [event["level"] for event in events] == ["warning"]
-    assert 'sim.faults = ["mute"]' in events[0]["text"]

@@ -30,7 +30,6 @@ from tests.system.harness import (
     Daemon,
     Program,
     environment,
-    finish,
     free_endpoint,
     until,
 )
@@ -116,28 +115,7 @@ def test_the_node_program_drives_the_robot_from_another_host(
     driven(words, tmp_path, standing, NODE_EXTRA_CA_CERTS=str(page.tls / "ca.pem"))
 
 
-@pytest.mark.slow
-@pytest.mark.nightly
-def test_the_java_program_says_that_no_robot_answers(tmp_path: Path) -> None:
-    java = program("java", "it runs the program")
-    nowhere = f"http://{free_endpoint().partition('/')[2]}"
-    missing = finish([java, str(CLIENTS / "java/Drive.java"), nowhere], tmp_path, 60.0)
-    assert missing.code == 1, missing
-    assert missing.err.startswith(f"no connection to {nowhere}: "), missing
-
-
-@pytest.mark.languages
-@pytest.mark.timeout(300)
-def test_the_go_program_drives_the_robot_from_another_host(
-    page: Page, standing: Bus, kept: Path
-) -> None:
-    here = copied("go", kept)
-    run([program("go", "it builds the program"), "build", "-o", "drive", "."], here)
-    away = [str(here / "drive"), page.away, page.invite("operator", "go")]
-    driven(away, here, standing, SSL_CERT_FILE=str(page.tls / "ca.pem"))
-
-
-@pytest.mark.parametrize("verb", ["state", "stop", "clear"])
+@pytest.mark.parametrize("verb", ["state", "stop"])
 def test_the_program_for_curl_fails_if_no_robot_answers(verb: str) -> None:
     program("curl", "the program calls it")
     missing = called(verb, {"ADDRESS": f"http://{free_endpoint().partition('/')[2]}"})

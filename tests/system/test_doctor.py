@@ -5,18 +5,14 @@ from __future__ import annotations
 import json
 import os
 import pty
-import socket
 import subprocess
 import sys
-import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from acsard.machine.authority import Authority
-from tests.each import each
 from tests.system.harness import (
     Bus,
     Daemon,
@@ -69,25 +65,6 @@ def test_a_machine_with_the_simulator_and_no_daemon_has_warnings_only(tmp_path: 
     assert findings["configuration"][0]["level"] == "ok"
     assert "simulator" in worst(findings["port"])["text"]
     assert "acsard run" in worst(findings["daemon"])["mend"]
-
-
-def test_every_mistake_in_the_configuration_is_a_failure(tmp_path: Path) -> None:
-    code, findings = examined(tmp_path, "[mcu]\nbaud = 1\n[robot]\nid = 3\n")
-    assert code == 1
-    assert [finding["level"] for finding in findings["configuration"]] == ["failure", "failure"]
-
-
-@each(
-    ("port", "words"),
-    [("/dev/acsar_that_is_not", "does not exist"), ("/etc/passwd", "not a serial device")],
-)
-def test_an_invalid_port_is_a_failure_that_refers_to_acsard_ports(
-    tmp_path: Path, port: str, words: str
-) -> None:
-    code, findings = examined(tmp_path, toml(port))
-    assert code == 1
-    assert words in worst(findings["port"])["text"]
-    assert "acsard ports" in worst(findings["port"])["mend"]
 
 
 def test_the_process_that_holds_the_port_is_named_with_its_pid(
@@ -153,29 +130,6 @@ def test_doctor_uses_the_running_daemon_s_values_and_reports_where_the_file_diff
             )
 
 
-@pytest.mark.nightly
-def test_doctor_finds_a_daemon_with_another_endpoint_and_id_by_the_same_options(
-    tmp_path: Path,
-) -> None:
-    where = free_endpoint()
-    with Daemon(tmp_path, words=("--listen", where, "--id", "other")) as daemon:
-        file = daemon.config.read_text()
-        _, blind = examined(tmp_path, file)
-        _, nameless = examined(tmp_path, file, "--connect", where)
-        _, findings = examined(tmp_path, file, "--connect", where, "--id", "other")
-    assert blind["daemon"][-1]["text"] == f"no program listens at {daemon.endpoint}"
-    assert "--connect" in blind["daemon"][-1]["mend"]
-    assert nameless["daemon"][-1]["level"] == "failure"
-    assert "--id" in nameless["daemon"][-1]["mend"]
-    (difference,) = [
-        finding["text"]
-        for finding in findings["configuration"]
-        if "other values" in finding["text"]
-    ]
-    assert 'robot.id = "other", not "acsar"' in difference
-    assert {"serial link", "daemon"} <= set(findings)
-
-
 @pytest.mark.skipif(os.geteuid() != 0, reason="makes a process namespace")
 def test_doctor_does_not_check_the_local_port_for_a_daemon_on_another_machine(
     tmp_path: Path,
@@ -213,48 +167,6 @@ def test_doctor_reports_the_faulty_board_of_a_running_daemon(
     assert f"acsard mcu check --port {port}" in finding["mend"]
     assert finding["level"] == ("warning" if linked else "failure")
     assert code == 1 or linked
-
-
-@pytest.mark.nightly
-def test_an_address_at_which_another_program_listens_is_a_failure(tmp_path: Path) -> None:
-    with socket.create_server(("127.0.0.1", 0)) as other:
-        endpoint = f"tcp/127.0.0.1:{other.getsockname()[1]}"
-        began = time.monotonic()
-        code, findings = examined(tmp_path, f'[bus]\nlisten = ["{endpoint}"]\n')
-        assert time.monotonic() - began < 25
-    assert code == 1
-    assert worst(findings["daemon"])["level"] == "failure"
-
-
-def with_certificates(where: Path, days: float) -> str:
-    directory = where / "tls"
-    directory.mkdir()
-    Authority.make(directory, "test", 10).issue(directory, "robot", ["localhost"], days)
-    return f'[bus]\nlisten = ["{free_endpoint()}"]\ntls = "{directory}"\n'
-
-
-def test_a_certificate_that_has_expired_is_a_failure(tmp_path: Path) -> None:
-    code, findings = examined(tmp_path, with_certificates(tmp_path, -3))
-    finding = worst(findings["certificates"])
-    assert (code, finding["level"]) == (1, "failure")
-    assert "expired 3 days ago" in finding["text"]
-
-
-@pytest.mark.nightly
-def test_the_certificate_of_the_options_or_the_environment_is_looked_at(tmp_path: Path) -> None:
-    text = with_certificates(tmp_path, 400)
-    (tmp_path / "other").mkdir()
-    Authority.make(tmp_path / "other", "test", 10).issue(tmp_path / "other", "me", [], 10)
-    other = str(tmp_path / "other")
-    option = examined(tmp_path, text, "--connect", "tls/127.0.0.1:1", "--tls", other)[1]
-    assert sorted(finding["level"] for finding in option["certificates"]) == ["ok", "warning"]
-    variable = examined(tmp_path, text.partition("tls =")[0], ACSARD_TLS=other)[1]
-    assert [finding["level"] for finding in variable["certificates"]] == ["warning"]
-
-
-def test_a_router_on_a_plain_endpoint_is_a_warning(tmp_path: Path) -> None:
-    _, findings = examined(tmp_path, toml(more='connect = ["tcp/127.0.0.1:7447"]\n'))
-    assert "every program that is connected to that router" in worst(findings["bus"])["text"]
 
 
 def test_ports_lists_the_serial_ports_or_refers_to_dmesg() -> None:

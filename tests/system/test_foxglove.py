@@ -10,20 +10,17 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from websockets.exceptions import InvalidStatus
 
-from acsard.foxglove.bridge import STOP_TIMEOUT_S
 from tests.system.harness import (
     Bus,
     Daemon,
     Program,
     acsard,
-    cpu_seconds,
     finish,
     free_endpoint,
     until,
 )
-from tests.system.viewer import SubscribedTopic, Viewer, opened
+from tests.system.viewer import Viewer, opened
 
 SLOW = pytest.mark.slow
 
@@ -119,47 +116,6 @@ def test_foxglove_shows_the_topics_of_a_recording_and_no_others(viewer: Viewer) 
     assert types == {topic: type_name for topic, (type_name, _) in TOPICS.items()}
 
 
-@SLOW
-def test_a_late_viewer_gets_tf_static_and_the_last_diagnostics(
-    viewer: Viewer, shows: Shows, bus: Bus
-) -> None:
-    first = viewer.show("/tf_static").first()[0]
-    with bus.follow("tf_static") as published:
-        for _ in range(4):
-            with Viewer(shows.port) as late:
-                assert late.show("/tf_static").first()[0].payload == first.payload
-        late_ones = len(published.seen)
-    # It is published once in 5 s. No viewer has waited for that.
-    assert late_ones < 4
-    viewer.show("/diagnostics").first()
-
-
-@SLOW
-@pytest.mark.nightly
-def test_the_log_topic_has_each_event_of_the_daemon_once(viewer: Viewer, bus: Bus) -> None:
-    looked = viewer.show("/log")
-    looked.first()
-    assert bus.get("srv/stop")["success"]
-    assert bus.get("srv/clear")["success"]
-    until(lambda: any("stopped by unnamed" in line for line in lines(looked)), 5.0, "the stop")
-    events = bus.get("events")["events"]
-    pairs = [(event["name"], event["text"].partition(" (")[0]) for event in events]
-
-    def all_of_them() -> bool:
-        messages = [looked.read(entry.payload) for entry in list(looked.came)]
-        rows = [(m.name, m.msg.partition(" (")[0]) for m in messages]
-        # More events may have happened since, because a busy machine keeps a link waiting.
-        return any(rows[at : at + len(pairs)] == pairs for at in range(len(rows)))
-
-    until(all_of_them, 5.0, f"{pairs} in {lines(looked)}")
-    payloads = [entry.payload for entry in looked.came]
-    assert len(payloads) == len(set(payloads))
-
-
-def lines(log: SubscribedTopic) -> list[str]:
-    return [log.read(message.payload).msg for message in list(log.came)]
-
-
 def test_a_key_is_subscribed_only_while_a_viewer_shows_it(viewer: Viewer, bus: Bus) -> None:
     # Zenoh tells a publisher of a key whether any subscriber listens.
     publisher: Any = bus.session.declare_publisher(f"{bus.root}/tf")
@@ -184,12 +140,6 @@ def test_a_viewer_has_no_service_but_stop_and_publishes_nothing(viewer: Viewer, 
     send(json.dumps({"linear": {"x": 0.3}, "angular": {}}).encode())
     looked.first(len(looked.came) + 20)
     assert bus.count("commands") == before
-
-
-@SLOW
-def test_an_older_viewer_is_refused(shows: Shows, bus: Bus) -> None:
-    with pytest.raises(InvalidStatus):
-        Viewer(shows.port, "foxglove.websocket.v1")
 
 
 @SLOW
@@ -228,15 +178,6 @@ def test_a_daemon_that_is_gone_is_reported_and_waited_for(tmp_path: Path) -> Non
 
 
 @SLOW
-def test_foxglove_ends_while_a_connection_never_sends_its_request(shared: Daemon) -> None:
-    with Shows(shared) as own, socket.create_connection(("127.0.0.1", own.port)):
-        with Viewer(own.port):  # the server has accepted the silent connection, too
-            pass
-        own.signal(signal.SIGTERM)
-        assert own.ended(STOP_TIMEOUT_S) == 0
-
-
-@SLOW
 def test_a_port_that_is_in_use_ends_with_75_and_the_remedy(shared: Daemon, tmp_path: Path) -> None:
     with socket.socket() as listener:
         listener.bind(("127.0.0.1", 0))
@@ -249,22 +190,3 @@ def test_a_port_that_is_in_use_ends_with_75_and_the_remedy(shared: Daemon, tmp_p
     assert "Address already in use" in ended.err
     assert "--address 127.0.0.1:" in ended.err
     assert "Traceback" not in ended.err
-
-
-@SLOW
-@pytest.mark.nightly
-def test_foxglove_without_shown_topics_costs_little_processor_time(
-    shows: Shows, viewer: Viewer, bus: Bus
-) -> None:
-    def cost() -> float:
-        """Return the processor time while the daemon publishes 300 odometry messages, s."""
-        with bus.follow("odom") as odom:
-            before = cpu_seconds(shows.pid)
-            until(lambda: len(odom.seen) >= 300, 20.0, "three seconds of odometry")
-            return cpu_seconds(shows.pid) - before
-
-    alone = cost()
-    looked = [viewer.show(topic) for topic in ("/odom", "/tf", "/joint_states")]
-    for view in looked:
-        view.first()
-    assert alone < cost() / 2

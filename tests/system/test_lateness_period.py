@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import pytest
-
 from tests.system.harness import (
     Bus,
     Daemon,
@@ -63,15 +61,7 @@ def is_even(periods: Periods, waited: float, up: bool) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "length",
-    [
-        1.0,
-        pytest.param(5.0, marks=pytest.mark.slow),
-        pytest.param(60.0, marks=pytest.mark.soak),
-    ],
-)
 def test_without_commands_a_second_is_a_hundred_lines_and_every_gap_is_accounted_for(
-    tmp_path: Path, length: float
+    tmp_path: Path,
 ) -> None:
-    is_even(*undisturbed(tmp_path, length))
+    is_even(*undisturbed(tmp_path, 1.5))

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import itertools
 import time
-from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import pytest
 
@@ -23,10 +22,7 @@ from tests.system.harness import (
     Following,
     Peer,
     ReceivedMessage,
-    Reply,
-    Speeds,
     Tables,
-    form,
     silence,
     twist,
     until,
@@ -136,126 +132,6 @@ def test_a_trailing_comma_and_wired_signs_and_letters_apply_on_the_wire(
     assert {(line[-3:], len(line)) for line in lines} == {(b",\r\n", 34)}
 
 
-def mixture() -> Reply:
-    """Return a board that replies in each accepted form in turn, and then in a mix of forms."""
-
-    def mixed(speeds: Speeds) -> bytes:
-        a, b, c, d = (f"{'n' if speed < 0 else 'p'}{abs(speed):.3f}" for speed in speeds)
-        return f"a{a[:-1]}, b{b},c{c[:-2]},  d{d},\n".encode()
-
-    def reply(speeds: Speeds) -> bytes:
-        return next(turns)(speeds)
-
-    turns = itertools.cycle([*ACCEPTED.values(), mixed])
-    return reply
-
-
-ACCEPTED: dict[str, Reply] = {
-    "plain": PLAIN,
-    "spaces": form(separator=", "),
-    "trailing_comma": form(comma=","),
-    "spaces_and_trailing_comma": form(separator=", ", comma=","),
-    "lf_only": form(end="\n"),
-    "one_integer_digit": form(pad=1),
-    "one_decimal": form(decimals=1),
-    "three_decimals": form(decimals=3),
-    "one_digit_one_decimal_spaces_comma_lf": form(", ", "\n", 1, 1, ","),
-}
-
-
-def steady(bus: Bus) -> Any:
-    """Return the state if the robot drives at 0.4 m/s, otherwise None."""
-    state = bus.state()
-    right = state["link"] == "up" and state["linear"] == pytest.approx(0.4, abs=0.005)
-    return state if right else None
-
-
-@pytest.mark.slow
-def test_every_accepted_reply_form_drives_odometry(tmp_path: Path, peer: Peer) -> None:
-    # 0.4 m/s is 8 rad/s, which needs only one digit and one decimal.
-    begun = time.monotonic()
-    with running(tmp_path, peer) as bus, bus.commanding(0.4):
-        until(lambda: peer.lines[-1].line.startswith(b"ap08.00"), 5.0, "steady driving")
-        for name, reply in {**ACCEPTED, "mixture": mixture()}.items():
-            peer.reply = reply
-            peer.await_lines(5)  # by then the replies in the previous form have been read
-            goal = bus.state()["x"] + 0.04
-            until(lambda: bus.state()["x"] > goal, 5.0, f"odometry moves by {name}")  # noqa: B023
-            after = until(lambda: steady(bus), 5.0, f"the speed by {name}")
-        rejects = {key for key in after["counters"] if key.startswith("line_")}
-        # A machine that takes the time of several ramp steps merges them into one.
-        leaps = {"line_implausible"} if lost(begun) > 0.05 else set()
-        assert rejects <= leaps, after["counters"]
-
-
-def always(data: bytes) -> Reply:
-    """Return a board that answers every line with `data`."""
-    return lambda speeds: data
-
-
-REFUSED: dict[str, tuple[str, Reply]] = {
-    "a wheel missing": ("malformed", always(b"ap10.00,bp10.00,cp10.00\r\n")),
-    "five wheels": ("malformed", always(b"ap10.00,bp10.00,cp10.00,dp10.00,ap10.00\r\n")),
-    "a wheel twice": ("duplicate_wheel", always(b"ap10.00,bp10.00,cp10.00,cp10.00\r\n")),
-    "no sign": ("malformed", always(b"a10.00,b10.00,c10.00,d10.00\r\n")),
-    "a minus": ("malformed", always(b"a-10.00,b-10.00,c-10.00,d-10.00\r\n")),
-    "another wheel": ("malformed", always(b"ap10.00,bp10.00,cp10.00,ep10.00\r\n")),
-    "upper case": ("malformed", always(b"AP10.00,BP10.00,CP10.00,DP10.00\r\n")),
-    "no decimals": ("malformed", always(b"ap10,bp10,cp10,dp10\r\n")),
-    "a bare point": ("malformed", always(b"ap10.,bp10.,cp10.,dp10.\r\n")),
-    "four decimals": ("malformed", always(b"ap10.0000,bp10.00,cp10.00,dp10.00\r\n")),
-    "three digits": ("malformed", always(b"ap100.00,bp10.00,cp10.00,dp10.00\r\n")),
-    "over 99.99": ("over_range", always(b"ap99.995,bp10.00,cp10.00,dp10.00\r\n")),
-    "nan": ("malformed", always(b"apnan,bp10.00,cp10.00,dp10.00\r\n")),
-    "inf": ("malformed", always(b"apinf,bp10.00,cp10.00,dp10.00\r\n")),
-    "an exponent": ("malformed", always(b"ap1e1,bp10.00,cp10.00,dp10.00\r\n")),
-    "a space inside": ("malformed", always(b"ap 10.00,bp10.00,cp10.00,dp10.00\r\n")),
-    "a space before the comma": ("malformed", always(b"ap10.00 ,bp10.00,cp10.00,dp10.00\r\n")),
-    "a space in front": ("malformed", always(b" ap10.00,bp10.00,cp10.00,dp10.00\r\n")),
-    "two commas": ("malformed", always(b"ap10.00,,bp10.00,cp10.00,dp10.00\r\n")),
-    "semicolons": ("malformed", always(b"ap10.00;bp10.00;cp10.00;dp10.00\r\n")),
-    "noise in front": ("malformed", always(b"\x00\xff~ap10.00,bp10.00,cp10.00,dp10.00\r\n")),
-    "half a line": ("malformed", always(b"ap10.00,bp10.0\r\n")),
-    "two lines in one": ("malformed", always(b"ap10.00,bp10.00,cap10.00,bp10.00,cp10.00\r\n")),
-    "words": ("malformed", always(b"Hello from the bootloader\r\n")),
-    "an endless line": ("too_long", always(b"ap10.00,bp10.00,cp10.00,dp10.00," * 8 + b"\r\n")),
-    "CR only": ("too_long", always(b"ap10.00,bp10.00,cp10.00,dp10.00\r")),
-}
-
-
-@pytest.mark.slow
-def test_every_refused_form_is_counted_and_only_zeros_are_sent_until_a_good_one_comes(
-    tmp_path: Path, peer: Peer
-) -> None:
-    peer.reply = silence
-    with running(tmp_path, peer, linked=False) as bus:
-        bus.put("cmd/app", ZERO)
-        with bus.follow("state") as states:
-            states.find(lambda state: state["link"] == "booting", 5.0, "booting")
-        # The peer sends unasked, because a silent peer gets only 10 lines a second to answer.
-        for reason, reply in REFUSED.values():
-            # A line may need more than one piece to be too long.
-            peer.send(reply(STANDING) * (5 if reason == "too_long" else 1))
-            bus.put("cmd/app", twist(0.5))
-        wanted = Counter(reason for reason, _ in REFUSED.values() if reason != "too_long")
-
-        def counted() -> Any:
-            state = bus.state()
-            count = state["counters"].get
-            complete = all(count(f"line_{reason}") == many for reason, many in wanted.items())
-            return state if complete and count("line_too_long", 0) >= 2 else None
-
-        # The daemon ignores these bytes, even with a commander that keeps sending.
-        state = until(counted, 5.0, "each line is counted by its reason")
-        assert (state["link"], state["x"], state["linear"]) == ("booting", 0.0, None)
-        assert state["counters"]["lines"] == 0
-        assert set(peer.session.raw_lines()[1:]) == {ZERO_LINE}
-        # The next newline resynchronises: after three good lines the link is up.
-        peer.send(b"\r\n")
-        peer.reply = PLAIN
-        bus.linked()
-
-
 @pytest.mark.slow
 def test_a_silent_board_is_reported_gets_only_zeros_and_drives_on_after_a_short_gap(
     tmp_path: Path, peer: Peer
@@ -275,36 +151,6 @@ def test_a_silent_board_is_reported_gets_only_zeros_and_drives_on_after_a_short_
         peer.reply = PLAIN
         again = until(lambda: _moving_since(peer, zeros[-1].at), 5.0, "driving again")
         assert wheels(again)[0] <= 20 * 0.05 + 0.01
-
-
-@pytest.mark.slow
-def test_after_a_silence_of_a_second_the_commander_must_be_neutral_first(
-    tmp_path: Path, peer: Peer
-) -> None:
-    with running(tmp_path, peer) as bus, bus.follow("state") as states:  # noqa: SIM117
-        with bus.commanding(0.5) as commander:
-            until(lambda: peer.lines[-1].line.startswith(b"ap10.00"), 5.0, "steady driving")
-            _, stale, zeros_from = _fall_silent(peer, states)
-            zeros = peer.await_lines(14)
-            # The daemon sends at 10 Hz while no replies come, whatever the commander wants.
-            assert {entry.line for entry in zeros} == {ZERO_LINE}
-            took = zeros[-1].at - zeros[0].at
-            assert 0.08 < took / 13 < 0.2 + lost(zeros[0].at, zeros[-1].at) / 13
-            peer.reply = PLAIN
-            back = states.find(lambda state: state["link"] == "up", 5.0, "up", after=stale.at).at
-            waiting = states.find(
-                lambda state: state["code"] == "neutral",
-                5.0,
-                "why it waits",
-                after=back,
-            )
-            assert waiting.value["mode"] == "ready"
-            peer.await_lines(50)
-            assert _moving_since(peer, zeros_from) is None
-            commander.wish = ZERO  # for a second, because the key alone identifies this sender
-            until(lambda: bus.state()["code"] != "neutral", 5.0, "neutral")
-            commander.wish = twist(0.5)
-            until(lambda: _moving_since(peer, zeros_from), 5.0, "driving after the zero")
 
 
 def _fall_silent(peer: Peer, states: Following) -> tuple[float, ReceivedMessage, float]:

@@ -111,15 +111,6 @@ def test_a_fault_of_the_daemon_is_reported_and_the_input_of_that_step_is_recorde
     assert "does not fail in this version" in again.out
 
 
-@pytest.mark.soak
-@pytest.mark.timeout(1200)
-def test_each_of_fifty_kills_costs_little_of_the_recording(tmp_path: Path) -> None:
-    for number in range(50):
-        where = tmp_path / str(number)
-        where.mkdir()
-        killed(where, 1.5 + 0.03 * number)
-
-
 @pytest.mark.slow
 def test_a_recording_is_complete_after_an_orderly_end_and_readable_only_by_its_group(
     tmp_path: Path,
@@ -133,21 +124,6 @@ def test_a_recording_is_complete_after_an_orderly_end_and_readable_only_by_its_g
     assert path.stat().st_mode & 0o777 == 0o640
     assert path.parent.stat().st_mode & 0o777 == 0o750
     assert replayed(tmp_path, path) > 3
-
-
-@pytest.mark.soak
-def test_a_full_disk_is_reported_and_costs_only_records(tmp_path: Path) -> None:
-    full = ["sh", "-c", 'ulimit -f 40; exec "$@"', "sh"]  # blocks of 512 bytes per file
-    with recording(tmp_path, before=full) as (daemon, bus):
-        with bus.commanding(0.3):
-            until(lambda: "File too large" in bus.state()["recording_error"], 30.0, "it is said")
-            assert bus.state()["mode"] == "driving"
-            row = next(r for r in bus.get("diagnostics")["status"] if "recording" in r["name"])
-            assert row["level"] == 1
-        assert any(e["level"] == "warning" for e in daemon.events("recording"))
-        until(lambda: bus.state()["recording_error"] == "", 30.0, "it is tried again")
-    for path in files(tmp_path):
-        assert replayed(tmp_path, path) > 0
 
 
 @pytest.mark.slow

@@ -176,21 +176,6 @@ def test_on_a_disk_smaller_than_the_limit_the_oldest_recordings_go(tmp_path: Pat
         assert replayed(tmp_path, left[-1]) > 0
 
 
-@pytest.mark.nightly
-def test_a_directory_that_is_read_only_is_reported_and_costs_only_records(tmp_path: Path) -> None:
-    with disk(tmp_path, "size=1m", "ro") as path:
-        with both(tmp_path, path / "record") as (daemon, bus, beside):
-            says(bus, "Read-only file system")
-            misses_what_the_other_misses("read-only", bus, beside)
-            subprocess.run(["mount", "-o", "remount,rw", str(path)], check=True)
-            says(bus, "")
-            with bus.commanding(0.3):
-                time.sleep(1.0)
-            daemon.process.terminate()
-            assert daemon.ended(5.0) == 0
-        lived_again(tmp_path, path / "record")
-
-
 @pytest.mark.skipif(shutil.which("gcc") is None, reason="needs gcc")
 @pytest.mark.nightly
 def test_a_disk_that_syncs_for_two_seconds_costs_no_period(tmp_path: Path) -> None:

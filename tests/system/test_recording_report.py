@@ -7,16 +7,13 @@ from __future__ import annotations
 
 import re
 import shutil
-import struct
 import subprocess
 from pathlib import Path
 
 import pytest
 
-from tests.system.chromium import CHROMIUM, DESKTOP, PHONE, SIDEWAYS, browsing
+from tests.system.chromium import CHROMIUM, PHONE, SIDEWAYS, browsing
 from tests.system.harness import until
-from tests.tools import pictures
-from tests.tools.pictures import LOOKS
 from tests.unit.test_recording_report import drive_of_two, evil, report
 
 BROWSER = shutil.which("chromium")
@@ -61,12 +58,6 @@ def test_a_report_is_drawn_and_an_injected_script_does_not_run(tmp_path: Path) -
     assert title.startswith("&lt;/script&gt;")
 
 
-WIDER = """[...document.querySelectorAll('body *')]
-    .filter(one => one.checkVisibility() && !one.closest('svg'))
-    .map(one => [one.tagName + '.' + one.className, one.getBoundingClientRect()])
-    .filter(([, box]) => box.left < -0.5 || box.right > innerWidth + 0.5)
-    .map(([name, box]) => [name, box.left, box.right])"""
-
 CUT = """[...document.querySelectorAll('.js-plotly-plot text')]
     .filter(one => one.textContent.trim())
     .map(one => [one.textContent, one.getBoundingClientRect(),
@@ -109,34 +100,3 @@ def test_plotly_knows_every_attribute_of_the_pictures(tmp_path: Path) -> None:
             ".map(error => error.msg)"
         )
         assert unknown == []
-
-
-@pytest.mark.nightly
-def test_no_part_of_a_report_is_wider_than_the_window_of_a_phone_or_a_desktop(
-    tmp_path: Path,
-) -> None:
-    path = tmp_path / "new.html"
-    notes = [f"{'0' * 70}.mcap"]
-    path.write_text(report(drive_of_two(), "robot-" * 12, notes), encoding="utf-8")
-    with browsing() as browser:
-        for width, height in (DESKTOP, PHONE):
-            browser.size(width, height, touch=width < 600)
-            browser.open(path.as_uri())
-            until(lambda: browser.js(DRAWN) == 2, 30.0, "all pictures")
-            assert browser.js("innerWidth") == width
-            assert browser.js("document.documentElement.scrollWidth") <= width
-            assert browser.js(WIDER) == []
-            widths = "[...document.querySelectorAll('.main-svg')].map(b => b.clientWidth)"
-            assert 0.7 * width < max(browser.js(widths)) <= width
-            print(f"{width}: {browser.js('document.documentElement.scrollWidth')} px wide")
-
-
-@pytest.mark.nightly
-def test_report_screenshots_have_the_width_of_the_screen_and_the_height_of_the_page(
-    tmp_path: Path,
-) -> None:
-    written = pictures.report(tmp_path)
-    sizes = [struct.unpack(">II", path.read_bytes()[16:24]) for path in written]
-    assert [width for width, _ in sizes] == [PHONE[0]] * 2 + [DESKTOP[0]] * 2
-    assert min(height for _, height in sizes) > 3 * DESKTOP[1]
-    assert len({path.read_bytes() for path in written}) == len(LOOKS) * 2

@@ -8,10 +8,9 @@ to end that need systemd.
 from __future__ import annotations
 
 import json
-import random
 import signal
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -154,14 +153,13 @@ def release(bus: Bus, kind: Kind) -> None:
 
 def check_and_release_latch(robot: Robot, bus: Bus, before: End, since: float) -> None:
     """Check that the latch of the previous daemon still stops the robot, and release it."""
-    spoiled = before.spoil is not whole
-    state = check_at_rest(robot, bus, "stopped" if spoiled else MODES[before.kind], since)
-    assert ("may have been lost" if spoiled else "before the restart") in state["reason"]
-    release(bus, "stop" if spoiled else before.kind)
+    state = check_at_rest(robot, bus, MODES[before.kind], since)
+    assert "before the restart" in state["reason"]
+    release(bus, before.kind)
 
 
 def restarted(robot: Robot, *ends: End) -> None:
-    """Run one daemon for each `End`: latch the robot, end the daemon, and damage the latch file.
+    """Run one daemon for each `End`: latch the robot, and end the daemon.
 
     Each next daemon must find that latch. The robot drives again after its release.
     """
@@ -180,28 +178,17 @@ def restarted(robot: Robot, *ends: End) -> None:
             assert (daemon.ended(5.0) == 0) is (end is not None and end.way == "term")
         if end:
             assert is_latched(robot, end.kind), end
-            end.spoil(robot.file)
         before = end
     with robot.daemon(), Bus(robot.endpoint) as bus:
         bus.linked()
         drives(robot, bus)
 
 
-def whole(file: Path) -> None: ...
-
-
-def cut(file: Path) -> None:
-    """Truncate the file at a random byte, as a power cut may."""
-    data = file.read_bytes()
-    file.write_bytes(data[: random.randrange(len(data) - 1)])
-
-
 class End(NamedTuple):
-    """How one daemon ends: the kind of its latch, the signal, and the damage to the latch file."""
+    """How one daemon ends: the kind of its latch, and the signal."""
 
     kind: Kind
     way: Way
-    spoil: Callable[[Path], None] = whole
 
 
 @pytest.mark.slow
@@ -211,51 +198,19 @@ def test_a_latched_robot_stays_at_rest_after_each_restart_until_it_is_released(
     restarted(robot, End("stop", "kill"), End("fault", "crash"), End("inactive", "abort"))
 
 
-@pytest.mark.soak
-@pytest.mark.timeout(3600)
-def test_no_end_of_the_process_moves_a_latched_robot(robot: Robot) -> None:
-    ways: tuple[Way, ...] = ("kill", "crash", "abort", "term")
-    kinds: tuple[Kind, ...] = ("stop", "fault", "inactive")
-    ends = [
-        End(kind, way, random.choice((whole, whole, cut)))
-        for _ in range(5)
-        for kind in kinds
-        for way in ways
-    ]
-    restarted(robot, *ends)
-    print(f"{len(ends)} ends of the process, 0 moved the robot")
-
-
-def kills_after_a_stop(robot: Robot, times: int, longest_s: float) -> list[float]:
-    """Kill a daemon many times, each time a random delay after it has answered a stop.
-
-    Returns the delays (s) after which the latch file did not contain the stop.
-    """
-    lost = []
-    for _ in range(times):
-        delay = random.uniform(0.0, longest_s)
+@pytest.mark.slow
+def test_a_stop_that_was_answered_survives_a_kill_at_any_moment(robot: Robot) -> None:
+    for delay in (0.0, 0.02):
         with robot.daemon() as daemon, Bus(robot.endpoint) as bus:
-            state = bus.state()
-            if state["mode"] == "stopped":
-                bus.get("srv/clear", {"numbers": [cause["number"] for cause in state["causes"]]})
+            if bus.state()["mode"] == "stopped":
+                bus.get("srv/clear")
             assert bus.get("srv/stop")["success"]
             answered = time.monotonic()
             while time.monotonic() < answered + delay:
                 pass
             daemon.signal(signal.SIGKILL)
             daemon.ended(5.0)
-        if not is_latched(robot, "stop"):
-            lost.append(delay)
-    return lost
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("times", [2, pytest.param(200, marks=pytest.mark.soak)])
-@pytest.mark.timeout(1200)
-def test_a_stop_that_was_answered_survives_a_kill_at_any_moment(robot: Robot, times: int) -> None:
-    lost = kills_after_a_stop(robot, times, 0.05)
-    print(f"{len(lost)} of {times} stops lost, at ms after the answer: {[1e3 * s for s in lost]}")
-    assert not lost
+        assert is_latched(robot, "stop"), delay
 
 
 SLOW_DISK = """\

@@ -31,7 +31,6 @@ from tests.system.ros_clients import (
     STAMPED,
     TF,
     TWIST,
-    Relay,
     changes,
     decode,
     over_router,
@@ -76,15 +75,11 @@ def test_a_bridge_that_starts_before_the_robot_joins_it_and_joins_it_again(
                 assert called._replace(replies=called.replies[:1]).trigger()[0]
 
 
-def test_announced_topics_have_routes_and_no_topic_is_sent_without_subscribers(
-    tmp_path: Path, dds: NewDomain
-) -> None:
+def test_announced_topics_have_routes(tmp_path: Path, dds: NewDomain) -> None:
     with (
         Daemon(tmp_path) as daemon,
-        Bus(daemon.endpoint) as bus,
-        Relay(daemon.endpoint) as relay,
         dds(tmp_path) as domain,
-        domain.bridge(relay.endpoint) as bridge,
+        domain.bridge(daemon.endpoint) as bridge,
     ):
         for name in PUBLISHED:
             bridge.logs(f"Route Subscriber (Zenoh:{name} -> ROS:/{name}) created")
@@ -92,13 +87,6 @@ def test_announced_topics_have_routes_and_no_topic_is_sent_without_subscribers(
             bridge.logs(f"Route Publisher (ROS:/{name} -> Zenoh:{name}) created")
         for name in SERVICES:
             bridge.logs("Route Service Client", f"Zenoh:{name}) created")
-        bus.linked()
-        quiet = relay.came
-        sent = bus.count("lines_sent")
-        until(lambda: bus.count("lines_sent") >= sent + 50, 5.0, "50 periods")
-        byte_count = relay.came - quiet
-        print(f"announced and unheard: {byte_count} bytes in 50 periods")
-        assert byte_count < 2000
         assert not [line for line in bridge.log if "WARN" in line or "ERROR" in line]
 
 
