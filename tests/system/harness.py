@@ -50,7 +50,7 @@ import tty
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple, Self, TypeVar
 
 import msgspec
 import zenoh
@@ -167,7 +167,7 @@ class Program:
         self._readers: list[threading.Thread] = []
         self._end_by = signal.SIGTERM
 
-    def __enter__(self: P) -> P:
+    def __enter__(self) -> Self:
         self.started = time.monotonic()
         self.process: subprocess.Popen[bytes] = subprocess.Popen(self.words, **self._how)
         for stream, lines in ((self.process.stdout, self.out), (self.process.stderr, self.err)):
@@ -573,7 +573,7 @@ class FarPeer(Program):
         self._heard: list[ReceivedLine] = []
         super().__init__([sys.executable, "-c", _FAR, str(self.path)], where)
 
-    def __enter__(self) -> FarPeer:
+    def __enter__(self) -> Self:
         super().__enter__()
         self.says("plugged")
         return self

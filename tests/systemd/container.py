@@ -21,7 +21,7 @@ from typing import Any, NamedTuple, NoReturn
 
 import pytest
 
-from tests.system.harness import ROOT, Program, ReceivedLine, until
+from tests.system.harness import ROOT, FarPeer, Program, until
 
 OURS = sys.version_info[:2]
 
@@ -384,7 +384,7 @@ while True:
 """
 
 
-class Board(Program):
+class Board(FarPeer):
     """A simulated serial board in the container, in a process with precedence over all others.
 
     Its timestamps are therefore reliable. It answers each command with the speeds requested two
@@ -393,29 +393,10 @@ class Board(Program):
     """
 
     def __init__(self, container: Container) -> None:
-        self._heard: list[ReceivedLine] = []
+        self._heard = []
         container.path(PORT).unlink(missing_ok=True)
-        super().__init__(container.inside("python3", "-c", _BOARD, PORT, LIES, only="mnC"), "/")
-
-    def __enter__(self) -> Board:
-        super().__enter__()
-        self.says("plugged")
-        return self
-
-    def since(self, at: float) -> list[ReceivedLine]:
-        """Return the lines after this time without their ends; "-" is an empty one or `?`."""
-        for text in self.out[1 + len(self._heard) :]:
-            stamp, _, line = text.partition(" ")
-            self._heard.append(ReceivedLine(float(stamp), line.encode()))
-        return [entry for entry in self._heard if entry.at > at]
-
-    def awaits(self, line: bytes, after: float = 0.0, within: float = 5.0) -> ReceivedLine:
-        """Wait for the first line after this time that starts with this prefix, and return it."""
-        return until(
-            lambda: next((h for h in self.since(after) if h.line.startswith(line)), None),
-            within,
-            f"{line!r} on the wire",
-        )
+        words = container.inside("python3", "-c", _BOARD, PORT, LIES, only="mnC")
+        Program.__init__(self, words, "/")
 
 
 _DRIVER = """\
@@ -492,3 +473,8 @@ class Driver(Program):
         )
         self.sends(speed)
         board.awaits(f"ap{speed / 0.05:05.2f}".encode(), after=obeyed)
+
+
+if __name__ == "__main__":  # `.ci/run` makes the root file system beside other work
+    if not needs():
+        build(Path(sys.argv[1]))

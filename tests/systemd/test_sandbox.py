@@ -6,7 +6,6 @@ import json
 import os
 import re
 import signal
-import time
 from pathlib import Path
 
 import pytest
@@ -101,21 +100,6 @@ def is_open(container: Container) -> None:
 
 
 @pytest.mark.nightly
-def test_with_lan_conf_the_gateway_reads_root_s_keys_and_listens_beyond_this_computer(
-    container: Container, board: Board
-) -> None:
-    opened(container)
-    viewer = ("--connect", "tls/127.0.0.1:7449", "--tls", f"{TLS}/clients/viewer")
-    result = container.run(ACSARD, "echo", "state", "-n", "1", *viewer)
-    assert result.code == 0, result.err
-    state = json.loads(result.out)
-    assert state["mode"] == "ready"
-    assert state["certificate_expiry"] == "valid for 730 days", (
-        "the daemon may not read it: the gateway tells"
-    )
-
-
-@pytest.mark.nightly
 def test_a_reload_gives_the_services_a_new_certificate_while_the_robot_drives(
     container: Container, board: Board
 ) -> None:
@@ -156,30 +140,6 @@ def test_a_gateway_has_limits_and_if_it_is_killed_it_is_restarted_and_the_daemon
     is_open(container)
     assert container.show("NRestarts", GATEWAY) == "1"
     assert container.main_pid() == daemon
-
-
-@pytest.mark.nightly
-def test_a_gateway_that_hangs_holds_up_no_stop_nor_restart_of_the_daemon(
-    container: Container, board: Board
-) -> None:
-    opened(container)
-    first = container.main_pid(GATEWAY)
-    os.kill(first, signal.SIGSTOP)
-    begun, waited = time.monotonic(), container.waited()
-    container.run("systemctl", "restart", UNIT)
-    took = time.monotonic() - begun
-    print(f"restarted in {took:.2f} s")
-    assert took < 1.7 + container.waited() - waited
-    until(lambda: container.show("ActiveState", GATEWAY) == "active", 10.0, "it came along")
-    is_open(container)
-    assert container.main_pid(GATEWAY) != first
-
-
-def test_without_lan_conf_there_is_no_gateway(container: Container, board: Board) -> None:
-    assert container.start().code == 0
-    container.start(GATEWAY)
-    assert container.show("ConditionResult", GATEWAY) == "no"
-    assert container.show("ActiveState", GATEWAY) == "inactive"
 
 
 def test_lan_conf_without_its_key_fails_the_start_of_the_unit(

@@ -249,19 +249,6 @@ def test_the_service_s_page_lists_and_serves_recordings_and_cannot_change_them(
     assert not bare.path(f"{STATE}-web").exists()  # a new instance accepts no old invitation
 
 
-@pytest.mark.nightly
-def test_a_purge_after_an_uninstall_removes_what_the_uninstall_kept(bare: Container) -> None:
-    bare.write(CONFIGURATION, "")  # the simulator
-    assert bare.run(ACSARD, "service", "install").code == 0
-    output = bare.run(ACSARD, "service", "uninstall").out
-    assert "keep    /etc/acsard  " in output
-    assert "keep    /var/lib/acsard  " in output
-    done = bare.run(ACSARD, "service", "uninstall", "--purge")
-    assert done.code == 0, done.out + done.err
-    for place in (CONFIGURATION, STATE, f"{STATE}-web", f"/etc/systemd/system/{UNIT}"):
-        assert not bare.path(place).exists(), place
-
-
 def test_a_foreign_file_is_not_overwritten_without_force(bare: Container) -> None:
     unit = f"/etc/systemd/system/{UNIT}"
     bare.write(unit, "[Service]\nExecStart=/bin/true\n")
@@ -274,6 +261,7 @@ def test_a_foreign_file_is_not_overwritten_without_force(bare: Container) -> Non
     assert bare.show("ActiveState") == "active"
 
 
+@pytest.mark.nightly
 def test_an_existing_configuration_is_kept_by_install_and_uninstall(bare: Container) -> None:
     own = '[robot]\nid = "mine"\n'
     bare.write(CONFIGURATION, own)
@@ -289,22 +277,3 @@ def test_only_root_installs(bare: Container) -> None:
     assert done.code == 77
     assert "sudo" in done.err
     assert not Path(bare.path(CONFIGURATION)).exists()
-
-
-@pytest.mark.nightly
-def test_after_lan_init_the_service_listens_on_the_network(bare: Container) -> None:
-    assert bare.run(ACSARD, "service", "install").code == 0
-    made = bare.run(ACSARD, "tls", "init", "--write", CONFIGURATION)
-    assert made.code == 0, made.out + made.err
-    bare.run("systemctl", "daemon-reload")
-    bare.run("systemctl", "restart", UNIT)
-    assert bare.show("ActiveState") == "active"
-    until(lambda: "open at" in bare.show("StatusText", GATEWAY), 10.0, "the gateway opens with it")
-    assert bare.show("NRestarts") == "0"
-    status = bare.run(ACSARD, "call", "stop", "--config", CONFIGURATION)
-    assert status.code == 0, status.err
-    viewer = ("--connect", "tls/127.0.0.1:7449", "--tls", "/etc/acsard/tls/clients/viewer")
-    assert bare.run(ACSARD, "call", "stop", *viewer).code == 0
-    assert bare.run(ACSARD, "call", "clear", *viewer).code == 77
-    assert bare.run(ACSARD, "service", "uninstall", "--purge").code == 0
-    assert not bare.path("/etc/systemd/system/acsard-gateway.service.d").exists()

@@ -6,10 +6,8 @@ import contextlib
 import fcntl
 import os
 import pty
-import resource
 import select
 import shutil
-import statistics
 import struct
 import subprocess
 import termios
@@ -204,25 +202,6 @@ def test_the_stop_script_falls_back_to_dev_acsar_and_says_so(tmp_path: Path, tex
     assert "/dev/acsar" in ended.err
 
 
-def test_the_stop_script_does_nothing_without_a_configuration(tmp_path: Path) -> None:
-    assert stop(tmp_path / "nothing")[:2] == (0, "")
-
-
-def test_a_port_that_accepts_no_bytes_does_not_delay_the_stop_script(
-    tmp_path: Path, wire: Wire
-) -> None:
-    tty.setraw(wire.slave)
-    for _ in range(10):
-        wire.fill()
-        ended = stop(config(tmp_path, f'[mcu]\nport = "{wire.name}"\n'))
-        if ended.code:
-            break  # otherwise it accepted more bytes: a busy kernel makes room much later
-    print(f"full port: given up after {ended.seconds:.3f} s")
-    assert ended.code == 1
-    assert wire.name in ended.err
-    assert ended.seconds < 1.0
-
-
 @pytest.mark.parametrize(
     ("result", "ended_by", "code"),
     [
@@ -251,27 +230,3 @@ def test_a_device_that_is_not_a_port_is_reported(tmp_path: Path) -> None:
     ended = stop(config(tmp_path, '[mcu]\nport = "/dev/null"\n'))
     assert ended.code == 0
     assert "cannot set every option of /dev/null" in ended.err
-
-
-def processor_s() -> float:
-    """Return the processor time that all ended child processes have used, s."""
-    used = resource.getrusage(resource.RUSAGE_CHILDREN)
-    return used.ru_utime + used.ru_stime
-
-
-def test_the_stop_script_takes_less_than_20_ms_of_processor_time(
-    tmp_path: Path, wire: Wire
-) -> None:
-    text = (ROOT / "acsard.toml").read_text().replace('port = "sim"', f'port = "{wire.name}"')
-    path = config(tmp_path, text)
-    took, spent = [], []
-    for _ in range(20):
-        before = processor_s()
-        took.append(1000 * stop(path).seconds)
-        spent.append(1000 * (processor_s() - before))
-    print(
-        f"stop script: {min(took):.1f} / {statistics.median(took):.1f} / {max(took):.1f} ms "
-        f"(min/median/max), {statistics.median(spent):.1f} ms of the processor"
-    )
-    # The script waits for nothing, so in any longer time other processes had the processor.
-    assert statistics.median(spent) < 20.0

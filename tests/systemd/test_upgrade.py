@@ -43,7 +43,6 @@ INSTALLED = "/srv/installed"
 SHORT_S = 10.0
 """Time of the watch of a good version. A busy machine starts the daemon in several seconds."""
 
-BACK_WITHIN_S = 45.0
 
 # What the launcher of a bad version does first.
 _AFTER = "import os, signal, threading; threading.Timer({after}, lambda: {does}).start()"
@@ -59,6 +58,8 @@ BAD = {
     "has no bus": "'run' in sys.argv and sys.argv.extend(('--listen', 'tcp/127.0.0.1:7999'))",
 }
 
+
+IN_CI = ("crashes at once", "refuses the configuration")
 
 HELLO = """\
 import asyncio, sys
@@ -206,12 +207,14 @@ def test_an_upgrade_runs_the_new_version_and_a_rollback_the_old_one_with_the_sto
     until(lambda: said in robot.container.run(*words).out, 20.0, "the page says so too")
 
 
-@pytest.mark.parametrize("how", ["crashes at once", "has no link", "refuses the configuration"])
+@pytest.mark.parametrize(
+    "how", [pytest.param(how, marks=() if how in IN_CI else pytest.mark.nightly) for how in BAD]
+)
 def test_the_old_version_runs_again_if_the_new_one_does_not_work(robot: Robot, how: str) -> None:
     robot.makes(NEW, BAD[how])
     robot.stops()
     number, began = robot.latch(), time.monotonic()
-    done = robot.changes(NEW, watch_s=4.0)
+    done = robot.changes(NEW, watch_s=8.0 if "later" in how else 4.0)
     assert done.code != 0
     assert NEW in done.err
     assert (robot.readlink(), robot.readlink("previous"), robot.runs()) == (
@@ -220,7 +223,7 @@ def test_the_old_version_runs_again_if_the_new_one_does_not_work(robot: Robot, h
         robot.old,
     )
     assert (robot.latch(), robot.moved(began)) == (number, [])
-    assert until(robot.link, 5.0, "the link is up again")
+    assert until(robot.link, 10.0, "the link is up again")
 
 
 def test_a_driving_robot_is_not_upgraded(robot: Robot) -> None:
@@ -234,105 +237,12 @@ def test_a_driving_robot_is_not_upgraded(robot: Robot) -> None:
         assert (robot.readlink(), robot.container.main_pid()) == (robot.old, pid)
 
 
-# The figures of an upgrade. They take an hour.
-
-TIMES = 20
-KILLS = 50
-nightly = pytest.mark.nightly
+KILLS = 6
 
 
-class Change(NamedTuple):
-    code: int
-    out: str
-    back_s: float
-    """From the change of the version to the end of the command."""
-
-
-def commanded(robot: Robot, *words: str) -> Change:
+def commanded(robot: Robot, *words: str) -> Ran:
     """Run a subcommand of `acsard service` that changes the version."""
-    command = robot.container.inside("acsard", "service", *words)
-    with subprocess.Popen(
-        command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
-    ) as process:
-        assert process.stdout is not None
-        out, switched = "", time.monotonic()
-        for line in process.stdout:
-            out += line
-            if "watching it" in line:
-                switched = time.monotonic()
-        return Change(process.wait(), out, time.monotonic() - switched)
-
-
-@nightly
-@pytest.mark.timeout(3600)
-def test_twenty_upgrades_and_rollbacks(robot: Robot) -> None:
-    robot.makes(NEW)
-    with Driver(robot.container) as driver:
-        for n in range(TIMES):
-            if latched := n % 2 == 0:
-                robot.stops()
-                driver.sends(0.3)
-            number, kept, recordings = robot.latch(), robot.kept(), robot.recordings()
-            assert (number != "0") is latched
-            began = time.monotonic()
-            for words, name in (
-                (("upgrade", f"{VERSIONS}/{NEW}"), NEW),
-                (("rollback",), robot.old),
-            ):
-                # One of ten is watched for 30 s.
-                done = commanded(robot, *words) if n % 10 == 0 else robot.changes(name)
-                assert done.code == 0, done
-                assert (robot.readlink(), robot.runs(), robot.link()) == (name, name, True)
-                assert (robot.latch(), robot.kept()) == (number, kept)
-            assert recordings <= robot.recordings()
-            assert robot.moved(began) == []
-            print(f"{n + 1} of {TIMES}: upgraded and rolled back, latched: {latched}")
-            driver.sends(0.0)
-            robot.types("call", "clear")
-
-
-@nightly
-@pytest.mark.timeout(1200)
-def test_twenty_upgrades_of_a_driving_robot_are_refused(robot: Robot) -> None:
-    robot.makes(NEW)
-    with Driver(robot.container) as driver:
-        driver.drives(robot.board)
-        pid = robot.container.main_pid()
-        for n in range(TIMES):
-            wait = ("--wait", str(n % 4))
-            done = robot.types("service", "upgrade", f"{VERSIONS}/{NEW}", *wait)
-            assert (done.code, "the robot drives" in done.err) == (1, True), done.err
-            assert (robot.readlink(), robot.container.main_pid()) == (robot.old, pid)
-    print(f"{TIMES} of {TIMES} refused")
-
-
-@nightly
-@pytest.mark.timeout(3600)
-def test_twenty_bad_versions_are_left_again_within_45_s(robot: Robot) -> None:
-    took: dict[str, list[float]] = {}
-    with Driver(robot.container) as driver:
-        for n in range(TIMES):
-            how = list(BAD)[n % len(BAD)]
-            robot.makes(NEW, BAD[how])
-            if n // len(BAD) % 2 == 0:
-                robot.stops()
-                driver.sends(0.3)
-            number, kept, recordings = robot.latch(), robot.kept(), robot.recordings()
-            began = time.monotonic()
-            done = commanded(robot, "upgrade", f"{VERSIONS}/{NEW}")
-            assert done.code == 1, done.out
-            assert done.back_s < BACK_WITHIN_S
-            assert (robot.readlink(), robot.runs()) == (robot.old, robot.old), done.out
-            until(robot.link, 5.0, "the link is up again")
-            assert (robot.latch(), robot.kept()) == (number, kept)
-            assert recordings <= robot.recordings()
-            assert robot.moved(began) == []
-            took.setdefault(how, []).append(done.back_s)
-            print(f"{how}: back after {done.back_s:.1f} s: {done.out.splitlines()[-1]}")
-            driver.sends(0.0)
-            robot.types("call", "clear")
-    for how, seconds in took.items():
-        print(f"{how}: {len(seconds)} of {len(seconds)}, at most {max(seconds):.1f} s")
+    return robot.types("service", *words)
 
 
 def environment(robot: Robot, number: str) -> str:
@@ -349,11 +259,11 @@ def environment(robot: Robot, number: str) -> str:
     return f"{place}/venv"
 
 
-@nightly
+@pytest.mark.nightly
 def test_an_environment_is_upgraded_to_by_its_directory(robot: Robot) -> None:
     place = environment(robot, "9.1.0")
     done = commanded(robot, "upgrade", place)
-    assert done.code == 0, done.out
+    assert done.code == 0, done
     assert (robot.readlink(), robot.runs()) == ("9.1.0", "9.1.0")
     assert '"version":"9.1.0"' in robot.types("get", "info").out.replace(" ", "")
     assert commanded(robot, "rollback").code == 0
@@ -384,12 +294,12 @@ def package(robot: Robot, number: str) -> str:
     return file
 
 
-@nightly
+@pytest.mark.nightly
 def test_a_package_is_upgraded_to_and_dpkg_alone_changes_nothing(robot: Robot) -> None:
     first, second = package(robot, "9.2.0"), package(robot, "9.3.0")
     try:
         done = commanded(robot, "upgrade", first)
-        assert done.code == 0, done.out
+        assert done.code == 0, done
         assert robot.runs() == "9.2.0"
         pid = robot.container.main_pid()
         robot.container.types(f"dpkg -i {second}")
@@ -399,13 +309,13 @@ def test_a_package_is_upgraded_to_and_dpkg_alone_changes_nothing(robot: Robot) -
         robot.container.run("systemctl", "restart", UNIT)
         assert robot.runs() == "9.2.0"
         done = commanded(robot, "upgrade", f"{VERSIONS}/9.3.0")
-        assert done.code == 0, done.out
+        assert done.code == 0, done
         assert (robot.runs(), robot.readlink("previous")) == ("9.3.0", "9.2.0")
     finally:
         robot.container.run("dpkg", "--purge", "acsard")
 
 
-@nightly
+@pytest.mark.nightly
 @pytest.mark.timeout(3600)
 def test_an_upgrade_that_is_killed_at_any_moment_leaves_a_version_that_starts(
     robot: Robot,
@@ -451,7 +361,7 @@ def test_an_upgrade_that_is_killed_at_any_moment_leaves_a_version_that_starts(
     print(f"started after {KILLS} kills: {started}")
 
 
-@nightly
+@pytest.mark.nightly
 def test_with_a_full_disk_the_old_version_runs_on_and_no_part_of_the_new_one_stays(
     robot: Robot,
 ) -> None:
@@ -470,7 +380,7 @@ def test_with_a_full_disk_the_old_version_runs_on_and_no_part_of_the_new_one_sta
         pid, before = container.main_pid(), container.types(f"ls -A {VERSIONS}").out
         for new in (place, file):
             done = commanded(robot, "upgrade", new)
-            assert (done.code, "No space left on device" in done.out) == (1, True), done.out
+            assert (done.code, "No space left on device" in done.out + done.err) == (1, True), done
             assert container.main_pid() == pid
             assert robot.link()
             robot.container.run("dpkg", "--purge", "acsard")
