@@ -6,8 +6,10 @@
 from __future__ import annotations
 
 import argparse
+import ast
 import re
 from collections.abc import Callable, Iterable, Iterator
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -92,6 +94,7 @@ def _sections(text: str) -> Iterator[tuple[str, str, list[tuple[str, str, str]]]
 
 def messages() -> str:
     """Return the fields of each message type."""
+    meanings = _meanings()
     parts: list[str] = []
     for name, schema in SCHEMAS.items():
         if name == "Config":
@@ -103,7 +106,7 @@ def messages() -> str:
             if kind != name and (kind in SCHEMAS or f"## {kind}\n" in "".join(parts)):
                 continue
             rows = (
-                (f"`{field}`", _kind(value), _flat(value.get("description", "")))
+                (f"`{field}`", _kind(value), meanings.get((kind.removesuffix("In"), field), ""))
                 for field, value in fields.get("properties", {}).items()
             )
             about = _flat(fields.get("description", ""))
@@ -115,6 +118,22 @@ def messages() -> str:
         "field says otherwise. A type whose\nname ends with `In` is for messages to the daemon.",
         *parts,
     )
+
+
+def _meanings() -> dict[tuple[str, str], str]:
+    """Return the strings below the fields of the message types, by type and field."""
+    found = {}
+    for module in (ROOT / "acsard/core/messages").glob("*.py"):
+        for kind in ast.walk(ast.parse(module.read_text(encoding="utf-8"))):
+            if isinstance(kind, ast.ClassDef):
+                for field, below in pairwise(kind.body):
+                    match field, below:
+                        case (
+                            ast.AnnAssign(target=ast.Name(id=name)),
+                            ast.Expr(value=ast.Constant(value=str(text))),
+                        ):
+                            found[kind.name, name] = _literal(text)
+    return found
 
 
 def _flat(text: str) -> str:
