@@ -9,8 +9,7 @@ from __future__ import annotations
 
 EQUIVALENT: dict[str, str] = {
     "acsard/core/motion/limits.py _approach: 'slope = slope if slope * wanted > 0 else 0.0' -> 'slope = slope if slope * wanted >= 0 else 0.0'": "where the product is 0 the slope is",
-    "acsard/core/guard.py Memory: 'ramp_ns: int = 0' -> 'ramp_ns: int = -1'": "a guard without a last line takes the ramps of its limits",
-    "acsard/core/guard.py Memory: 'stop_ramp_ns: int = 0' -> 'stop_ramp_ns: int = -1'": "a guard without a last line takes the ramps of its limits",
-    "acsard/core/link/codec.py Codec.decode: 'wheel[index] = speed * sign' -> 'wheel[index] = speed / sign'": "the sign is 1 or -1",
+    "acsard/core/guard.py Memory: 'ramp_ns: Ns = 0' -> 'ramp_ns: Ns = -1'": "a guard without a last line takes the ramps of its limits",
+    "acsard/core/guard.py Memory: 'stop_ramp_ns: Ns = 0' -> 'stop_ramp_ns: Ns = -1'": "a guard without a last line takes the ramps of its limits",
     "acsard/core/link/codec.py Codec.wheels: 'wheel[index] = motor * sign' -> 'wheel[index] = motor / sign'": "the sign is 1 or -1",
 }
