@@ -64,8 +64,6 @@ port resets the board."""
 START_SAMPLES = 10
 """Number of odometry samples that must arrive before the daemon's start counts as complete."""
 
-CHECK_PERIOD_S = 0.5
-"""Interval at which the benchmark checks that all its processes are running, s."""
 
 SIMULATOR_PROCESS = "the simulated microcontroller's process"
 

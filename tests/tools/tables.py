@@ -8,7 +8,6 @@ from __future__ import annotations
 import re
 from collections.abc import Callable
 from pathlib import Path
-from typing import get_args
 
 from acsard.core.config.settings import Config
 from acsard.core.messages.keys_and_roles import (
@@ -22,14 +21,13 @@ from acsard.core.messages.keys_and_roles import (
 )
 from acsard.core.messages.permissions import (
     COMMAND_ROLE,
-    SERVICE_ROLES,
     USES,
     Use,
     has,
     keys_for,
 )
 from acsard.core.ros.transports import ros_names
-from acsard.core.values import ROLES, Role, Verb
+from acsard.core.values import ROLES, Role
 from acsard.machine.router_file import EXAMPLE_ROBOT
 from tests.tools.reference import GENERATED, table
 
@@ -52,28 +50,6 @@ def _least(topic: Topic) -> str:
     if topic.query == "<role>":
         return "that role"
     return topic.publish or topic.query or topic.subscribe or ""
-
-
-def roletable() -> str:
-    """Return the permissions of each role."""
-    rows = []
-    for role in ROLES:
-        verbs = [f"`{verb}`" for verb, least in SERVICE_ROLES.items() if least == role]
-        asked = [f"`{t.key}`" for t in TOPICS if t.direction == "query" and t.query == role]
-        if role == "viewer":
-            above = [t.key for t in TOPICS if t.direction == "query" and t.query in ROLES[1:]]
-            others = ", ".join(f"`{key}`" for key in above)
-            may = ["follow every published key", f"query every other key except {others}"]
-            calls = ", ".join(verb for verb in verbs if verb != "`stop`")
-            may += ["**stop** the robot", *([f"call {calls}"] if calls else [])]
-        else:
-            may = [f"all of {ROLES[ROLES.index(role) - 1]}"]
-            may += ["drive by the listed sources"] if role == COMMAND_ROLE else []
-            may += [f"call {', '.join(verbs)}", *(f"query {key}" for key in asked)]
-            put = [f"`{key}`" for key in keys_for(role, "publish", TOPICS)]
-            may += [f"publish {', '.join(put)}"] if put else []
-        rows.append((role, "; ".join(may)))
-    return table(("role", "permissions"), rows)
 
 
 # the router's file
@@ -157,13 +133,6 @@ def ros_page(text: str) -> str:
     """Return the page about ROS with the services that ROS can call."""
     verbs = ", ".join(f"`acsard/{verb}`" for verb in PLAIN_SERVICES)
     return _replaced(r"(^\| )(?:`acsard/\w+`(?:, )?)+(?= \| std_srvs/Trigger \|)", verbs, text)
-
-
-def service_page(text: str) -> str:
-    """Return the page about the service with the table of roles and the events of the verbs."""
-    verbs = " ".join(f"`{verb}`" for verb in get_args(Verb))
-    text = _replaced(r"(^\| A service call was executed.*? \| )(?:`\w+` ?)+(?= \|)", verbs, text)
-    return _marked("roles", roletable())(text)
 
 
 # all files

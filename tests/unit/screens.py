@@ -75,17 +75,6 @@ def lines_of(data: ScreenData, width: int = 80) -> list[str]:
     return drawn(screen(data, width), width).rstrip("\n").split("\n")
 
 
-def painted(data: ScreenData, width: int = 80) -> str:
-    """Return the screen as it is sent to a terminal."""
-    return drawn(screen(data, width), width, colour=True)
-
-
-def line_with(text: str, data: ScreenData = SEEN, width: int = 80) -> str:
-    matches = [line for line in lines_of(data, width) if text in line]
-    assert len(matches) == 1, (text, matches)
-    return matches[0]
-
-
 def of(**changes: object) -> ScreenData:
     """Return the usual screen with another state."""
     return replace(SEEN, state=replace(STATE, **changes))

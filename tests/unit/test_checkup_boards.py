@@ -32,7 +32,6 @@ from tests.unit.checkup_robots import Checked, Nobody, Person, Robot, check
 
 WORDS = Path(__file__).with_name("words")
 
-MOTORS = "abcd"
 SPEED = re.compile(rb"[abcd][pn](\d\d\.\d\d)")
 COARSE = Config(sim=SimConfig(encoder_counts=16))
 HEAVY = Config(sim=SimConfig(motor_time_constant=1.0))

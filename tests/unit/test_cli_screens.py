@@ -172,8 +172,6 @@ def test_a_usual_screen_fits_80_by_24() -> None:
 
 # robots of a fleet
 
-ROW = Row("robot1", True, replace(STATE, reason="commanded by app"), 0.1)
-
 
 # any message from the bus
 

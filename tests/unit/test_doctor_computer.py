@@ -9,8 +9,6 @@ import pytest
 from acsard.host.kernel_counters import Conditions, Kernel, Reading, SlowClock, slow_clock
 from tests.unit.kernel_files import COOLER, COUNT, FIRMWARE, HWMON, POLICY, QUIET, write
 
-TICK = 10_000_000
-
 
 def test_a_computer_without_these_files_has_zeros(tmp_path: Path) -> None:
     assert Kernel(tmp_path).read() == Reading()

@@ -16,10 +16,6 @@ law = settings(max_examples=100)
 Pair = tuple[float, float]
 
 
-def near(linear: float, angular: float) -> object:
-    return pytest.approx((linear, angular), abs=1e-12)
-
-
 def pair(twist: Twist) -> Pair:
     return twist.linear, twist.angular
 

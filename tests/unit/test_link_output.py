@@ -137,17 +137,6 @@ def test_a_session_begins_with_a_plain_stop_and_the_question_follows_the_first_l
 # a blocked output
 
 
-def blocked(ms: float) -> LinkBench:
-    """Return a session whose port sent no line for this time, although good lines arrived."""
-    bench = LinkBench().up()
-    bench.line()
-    bench.update(True, 10, GOOD)
-    for _ in range(round(ms / 10)):
-        bench.line()
-        bench.update(False, 10, GOOD)
-    return bench
-
-
 # when rest was commanded
 
 FREE = McuConfig(reply_period=0.01)

@@ -10,6 +10,7 @@ import sys
 import threading
 from contextlib import AsyncExitStack
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import pytest
 from msgspec.structs import replace
@@ -23,6 +24,7 @@ from acsard.host.logs import Log
 from acsard.host.systemd import Systemd
 from acsard.recording import recorder
 from acsard.recording.file import Failure, Recording
+from tests.each import each
 from tests.scenarios.world import World
 
 
@@ -86,10 +88,10 @@ def test_systemd_receives_stopping_before_the_daemon_cleans_up_after_an_error(
         assert service_manager.recv(4096).decode() == "STATUS=ending after an error in the daemon"
 
 
-async def first_event(kind: Kind = GATEWAY) -> Event:
+async def first_event() -> Event:
     """Return the first event of the supervisor."""
     queue: asyncio.Queue[Event] = asyncio.Queue()
-    keeper = asyncio.create_task(keep_running(["gateway"], queue.put_nowait, kind))
+    keeper = asyncio.create_task(keep_running(["gateway"], queue.put_nowait, GATEWAY))
     first = asyncio.create_task(queue.get())
     await asyncio.wait({keeper, first}, return_when=asyncio.FIRST_COMPLETED, timeout=10.0)
     assert not keeper.done(), keeper
@@ -131,50 +133,42 @@ def test_a_program_that_falls_silent_is_killed(
         os.kill(int(pid.read_text()), signal.SIGCONT)
 
 
-@pytest.mark.parametrize(("kind", "code"), [(PAGE, 2), (PAGE, 75), (PAGE, 77), (PAGE, 78)])
-def test_a_program_that_cannot_start_at_first_is_given_up(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, kind: Kind, code: int
+@each(
+    ("kind", "codes", "result"),
+    [
+        *((PAGE, (code,), code) for code in (2, 75, 77, 78)),  # it cannot start
+        (PAGE, (1, 0), 0),  # a person ended it
+        *((PAGE, (1, code), None) for code in (2, 77, 78)),  # it ran, so its files may be mended
+        (PAGE, (1,), None),
+        (GATEWAY, (78,), None),
+    ],
+)
+def test_a_program_is_started_again_unless_it_never_ran_or_a_person_ended_it(
+    kind: Kind, codes: tuple[int, ...], result: int | None
 ) -> None:
-    program(monkeypatch, tmp_path, f"raise SystemExit({code})")
-    events: list[Event] = []
-    assert asyncio.run(keep_running(["any"], events.append, kind)) == code
-    (event,) = events
-    assert (event.name, event.level) == (kind.ended, "warning")
-    assert kind.remedy in event.text
-
-
-@pytest.mark.parametrize(("kind", "code"), [(PAGE, 2), (PAGE, 77), (PAGE, 78)])
-def test_a_program_that_once_ran_is_started_again_when_its_files_are_wrong(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, kind: Kind, code: int
-) -> None:
-    monkeypatch.setattr("acsard.daemon.supervisor.LONG_RESTART_PAUSE_S", 0.01)
-    kind = replace(kind, restart_pause_s=0.01)
-    began = tmp_path / "began"
-    ends = f"import os; p = {str(began)!r}; new = not os.path.exists(p); open(p, 'a').close(); "
-    program(monkeypatch, tmp_path, ends + f"raise SystemExit(1 if new else {code})")
+    """The program ends with these exit codes, and with the last one again and again."""
     events: list[Event] = []
 
-    async def runs() -> None:
+    async def run() -> int | None:
         keeper = asyncio.create_task(keep_running(["any"], events.append, kind))
-        while len(events) < 3 and not keeper.done():
-            await asyncio.sleep(0.01)
-        assert not keeper.done()
+        async with asyncio.timeout(10.0):
+            while len(events) < 3 and not keeper.done():
+                await asyncio.sleep(0.01)
+        if keeper.done():
+            return keeper.result()
         keeper.cancel()
+        return None
 
-    asyncio.run(asyncio.wait_for(runs(), 10.0))
-    assert {event.name for event in events} == {kind.ended}
-
-
-def test_a_page_that_a_person_ends_after_it_ran_stays_ended(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    began = tmp_path / "began"
-    ends = f"import os; p = {str(began)!r}; new = not os.path.exists(p); open(p, 'a').close(); "
-    program(monkeypatch, tmp_path, ends + "raise SystemExit(1 if new else 0)")
-    events: list[Event] = []
-    page = replace(PAGE, restart_pause_s=0.01)
-    assert asyncio.run(keep_running(["web"], events.append, page)) == 0
-    assert [PAGE.remedy in event.text for event in events] == [False, True]
+    kind = replace(kind, restart_pause_s=0.01)
+    with pytest.MonkeyPatch.context() as patched, TemporaryDirectory() as where:
+        patched.setattr("acsard.daemon.supervisor.LONG_RESTART_PAUSE_S", 0.01)
+        ends = f"import os; p = {where!r} + '/runs'; open(p, 'a').write('.'); "
+        ends += f"codes = {codes}; raise SystemExit(codes[min(os.stat(p).st_size, len(codes)) - 1])"
+        program(patched, Path(where), ends)
+        assert asyncio.run(run()) == result
+    assert {(event.name, event.level) for event in events} == {(kind.ended, "warning")}
+    told = [f"it is not restarted: {kind.remedy}" in event.text for event in events]
+    assert told == [False] * (len(events) - 1) + [result is not None]
 
 
 def test_the_first_page_that_could_be_started_counts_as_the_first(
@@ -193,12 +187,3 @@ def test_the_first_page_that_could_be_started_counts_as_the_first(
 
     assert asyncio.run(keep_running(["web"], log, PAGE)) == 78
     assert [PAGE.remedy in event.text for event in events] == [False, True]
-
-
-@pytest.mark.parametrize(("kind", "code"), [(GATEWAY, 78), (PAGE, 1)])
-def test_a_program_that_may_start_later_is_restarted(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, kind: Kind, code: int
-) -> None:
-    program(monkeypatch, tmp_path, f"raise SystemExit({code})")
-    event = asyncio.run(first_event(kind))
-    assert event.name == kind.ended

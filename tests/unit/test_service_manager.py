@@ -5,10 +5,8 @@ from __future__ import annotations
 import itertools
 import os
 import socket
-import stat
 import time
 from collections.abc import Iterator
-from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -86,16 +84,6 @@ def test_without_a_manager_nothing_happens(address: str) -> None:
     stepped(nobody, NS_PER_S)
     nobody.stopping()
     nobody.close()
-
-
-def sockets() -> set[int]:
-    """Return the open sockets of this process."""
-    descriptors = set()
-    for fd in map(int, os.listdir("/proc/self/fd")):
-        with suppress(OSError):  # the descriptor that listed the directory
-            if stat.S_ISSOCK(os.fstat(fd).st_mode):
-                descriptors.add(fd)
-    return descriptors
 
 
 def test_the_life_of_a_service_is_told_in_one_datagram_each(manager: Manager) -> None:

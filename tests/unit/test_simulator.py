@@ -55,10 +55,6 @@ def drive(mcu: FakeMcu, start_ns: int, count: int, line: bytes = LINE) -> Heard:
     return chunks
 
 
-def joined(chunks: Heard) -> bytes:
-    return b"".join(data for _, data in chunks)
-
-
 # The board and an independent model of it.
 
 TOKENS = b",".join(b"%c([pn])(\\d\\d\\.\\d\\d)" % motor for motor in b"abcd")

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import asyncio
 import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
 from threading import Thread
 from typing import Any, cast
 
@@ -18,13 +20,18 @@ NO_ROOM = 1 << 46
 """Stack size that no machine can provide, so that a thread with it cannot start."""
 
 
-def test_a_thread_that_cannot_be_started_raises_a_timeout_error() -> None:
+@contextmanager
+def no_more_threads() -> Iterator[None]:
     usual = threading.stack_size(NO_ROOM)
     try:
-        with pytest.raises(TimeoutError, match="cannot start another thread"):
-            asyncio.run(in_thread(lambda: 1, None))
+        yield
     finally:
         threading.stack_size(usual)
+
+
+def test_a_thread_that_cannot_be_started_raises_a_timeout_error() -> None:
+    with no_more_threads(), pytest.raises(TimeoutError, match="cannot start another thread"):
+        asyncio.run(in_thread(lambda: 1, None))
     assert asyncio.run(in_thread(lambda: 1, None)) == 1
 
 
@@ -102,12 +109,8 @@ def test_a_future_has_the_result_or_the_error_of_its_call_when_it_wakes_the_call
 
 
 def test_a_future_whose_thread_cannot_be_started_raises_an_error() -> None:
-    usual = threading.stack_size(NO_ROOM)
-    try:
-        with pytest.raises(NoThreadError, match="cannot start another thread"):
-            future_of(lambda: 1, lambda: None)
-    finally:
-        threading.stack_size(usual)
+    with no_more_threads(), pytest.raises(NoThreadError, match="cannot start another thread"):
+        future_of(lambda: 1, lambda: None)
 
 
 WAIT_S = 10.0
