@@ -89,16 +89,6 @@ def test_an_authority_of_another_program_without_constraints_may_sign_for_any_na
     assert Authority(certificate, key).permits("bank.example")
 
 
-@each("name", ["anna", "anna.meyer", "laptop-anna.example.com"])
-def test_a_person_s_certificate_is_valid_even_if_its_name_looks_like_a_host(
-    authority: tuple[Authority, Path], name: str, tmp_path: Path
-) -> None:
-    ours, where = authority
-    ours.issue(tmp_path / "robot", "robot", ["robot1"], 1)
-    ours.issue(tmp_path / "person", name, [f"{name}.local"], 1)
-    assert connects(where, tmp_path / "robot", "robot1", tmp_path / "person")
-
-
 def test_a_disk_that_refuses_a_file_leaves_the_earlier_key_and_certificate(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -18,7 +18,6 @@ from acsard.bus.robot_discovery import (
 from acsard.bus.zenoh_sessions import daemon_session
 from acsard.client import connect
 from acsard.core.config.settings import BusConfig, Config
-from acsard.core.messages.keys_and_roles import PUBLISHED
 from acsard.host.errors import InUseError, MendableError, UnreachableError, UsageError
 from tests.each import each
 
@@ -161,11 +160,6 @@ def test_a_silence_is_explained(
     assert words in text
     assert text.startswith("robot acsar is there, but ") == presence.here
     assert text.count("robot0") in (0, MAX_NAMED)
-
-
-@each("key", [topic.key for topic in PUBLISHED])
-def test_each_published_key_has_a_reason(key: str) -> None:
-    assert "no such key" not in explain_silence(key, "acsar", PLAIN, HERE)
 
 
 def test_over_tls_the_message_asks_for_the_names_of_the_robots() -> None:

@@ -76,19 +76,6 @@ def test_a_robot_offers_the_keys_of_its_configuration() -> None:
             assert {*published(each_config)} == {*expected}
 
 
-@each(
-    ("key", "pattern"),
-    [("cmd/<source>", "cmd/*"), ("wheel_cmd/<source>", "wheel_cmd/*"),
-     ("cmd/<source>/<certificate>", "cmd/*/*"),
-     ("schema/<Type>", "schema/*"), ("json/<key>", "json/**"),
-     ("odom", "odom"), ("srv/stop", "srv/stop")],
-)  # fmt: skip
-def test_a_placeholder_is_a_wildcard_on_the_bus(key: str, pattern: str) -> None:
-    row = by_key(key)
-    assert row is not None
-    assert row.pattern == pattern
-
-
 def test_keys_are_built_from_the_robot_the_source_and_the_certificate() -> None:
     assert full_key("r7", "cmd/teleop") == "acsard/r7/cmd/teleop"
     assert json_key("sim/pose") == "json/sim/pose"

@@ -30,11 +30,9 @@ from acsard.core.ros.names import (
     TYPE_HASHES,
     Node,
     Qos,
-    bridge_key,
     bridge_presence,
     bridge_token,
     dds_type,
-    full_name,
     gid,
     rmw_key,
     rmw_qos,
@@ -111,16 +109,6 @@ def test_another_program_computes_the_same_hash_from_the_definition(name: str) -
 
 
 # names
-
-
-@each(
-    ("namespace", "name", "full"),
-    [("", "odom", "/odom"), ("robot1", "cmd_vel", "/robot1/cmd_vel"),
-     ("fleet/robot1", "acsard/stop", "/fleet/robot1/acsard/stop")],
-)  # fmt: skip
-def test_a_namespace_is_the_front_of_the_full_name(namespace: str, name: str, full: str) -> None:
-    assert full_name(namespace, name) == full
-    assert bridge_key(full) == full[1:]
 
 
 @each(

@@ -93,58 +93,45 @@ def test_a_missing_file_is_created_only_if_the_caller_permits_it(tmp_path: Path)
     assert os.listdir(tmp_path) == ["acsard.toml"]
 
 
-def start_with(file: Path) -> None:
-    parse(find(str(file))[1])
-
-
 def connect_with(file: Path) -> None:
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("ACSARD_CONFIG", str(file))
         address_by_environment(None, None, None)
 
 
-def edit_by_command(file: Path) -> None:
-    change(file, KEYS)
+USES: dict[str, Callable[[Path], object]] = {
+    "the daemon starts with it": lambda file: parse(find(str(file))[1]),
+    "a program connects with it": connect_with,
+    "a command edits it": lambda file: change(file, KEYS),
+    "a command makes it": lambda file: change(file, KEYS, new=True),
+    "a command will edit it": lambda file: require_changeable(file, KEYS),
+}
 
 
-@pytest.mark.parametrize("use", [start_with, connect_with, edit_by_command])
-def test_a_huge_file_is_refused_without_being_read_to_its_end(
-    tmp_path: Path, use: Callable[[Path], None]
-) -> None:
+@pytest.mark.parametrize("use", [*USES][:3])
+def test_a_huge_file_is_refused_without_being_read_to_its_end(tmp_path: Path, use: str) -> None:
     """`truncate -s 1G acsard.toml` must not take the memory or the time of a running daemon."""
     file = tmp_path / "acsard.toml"
     # The limit lies within a character, which must not hide the cause.
     file.write_text("é" * 40_000)
     os.truncate(file, 1 << 26)
+    errors, words = (ConfigError, MendableError, UsageError), "too large for a configuration"
     tracemalloc.start()
     try:
-        with pytest.raises(
-            (ConfigError, MendableError, UsageError), match="too large for a configuration"
-        ):
-            use(file)
+        with pytest.raises(errors, match=words):
+            USES[use](file)
         assert tracemalloc.get_traced_memory()[1] < 1 << 23
     finally:
         tracemalloc.stop()
 
 
-def make_new(file: Path) -> None:
-    change(file, KEYS, new=True)
-
-
-def require(file: Path) -> None:
-    require_changeable(file, KEYS)
-
-
-@pytest.mark.parametrize("use", [edit_by_command, make_new, require])
-def test_a_loop_of_symbolic_links_is_refused_and_kept(
-    tmp_path: Path, use: Callable[[Path], None]
-) -> None:
+@pytest.mark.parametrize("use", [*USES][2:])
+def test_a_loop_of_symbolic_links_is_refused_and_kept(tmp_path: Path, use: str) -> None:
     file = tmp_path / "acsard.toml"
     file.symlink_to(file)
-    with pytest.raises(
-        MendableError, match=r"was not changed: .*Too many levels of symbolic links"
-    ):
-        use(file)
+    words = r"was not changed: .*Too many levels of symbolic links"
+    with pytest.raises(MendableError, match=words):
+        USES[use](file)
     assert file.is_symlink()
 
 

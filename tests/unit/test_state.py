@@ -19,17 +19,15 @@ from acsard.core.values import (
     Cause,
     CauseKind,
     Command,
-    Event,
     Latches,
     Refusal,
-    Request,
     SpeedCap,
     Twist,
     Verb,
     WheelSpeeds,
 )
 from tests.each import each
-from tests.unit.rig import GO, MS, ROLLING, WALL_NS, Rig, names
+from tests.unit.rig import GO, ROLLING, WALL_NS, Rig, names
 
 # the mode
 
@@ -208,18 +206,6 @@ def test_a_service_that_is_called_continuously_causes_one_event_per_second() -> 
     assert [event.count for event in events] == [1, 100, 100]
 
 
-def test_a_stop_that_arrives_before_its_query_and_with_it_is_one_event() -> None:
-    rig = Rig().linked()
-    for _ in range(2):
-        ahead = Request("stop", asked_ns=rig.now_ns, by="joe (native)")
-        events = rig.asked(ahead).events
-        out = rig.asked(replace(ahead, id=7), ms=1500)
-        assert out.answers[0].success
-        stops = [event for event in (*events, *out.events) if event.name == "stop"]
-        assert [(event.by, event.count) for event in stops] == [("joe (native)", 1)]
-        rig.now_ns += 1500 * MS
-
-
 def test_a_refused_command_is_reported_with_its_reason_and_its_sender() -> None:
     (event,) = Rig().linked().step(REST, source="nobody").events
     assert (event.name, event.level, event.code) == ("command_refused", "warning", "unknown_source")
@@ -244,15 +230,6 @@ def test_a_speed_limit_applies_until_it_ends_and_each_change_is_an_event() -> No
     assert cap(None) == ["joe"]
     assert rig.run(60, GO).applied == GO
     assert rig.snapshot.speed_limit == ""
-
-
-def test_events_from_outside_the_robot_come_first_and_are_throttled() -> None:
-    lost = Event("port_lost", "it is gone", "warning")
-    events = [event for out in Rig().each(1000, events=(lost,)) for event in out.events]
-    assert events[0] == lost
-    lines = [event for event in events if event.name == "port_lost"]
-    assert len(lines) <= 15
-    assert sum(event.count for event in lines) > 900
 
 
 def test_more_than_one_implausible_line_in_a_hundred_is_an_event() -> None:
