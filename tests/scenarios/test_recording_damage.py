@@ -16,7 +16,7 @@ from acsard.recording.recorder import Recorder
 from acsard.recording.replay import Playback
 from tests.scenarios.world import World
 
-SECONDS = 200
+SECONDS = 100
 
 FRAME_S = 20
 """Longest part of a drive that damage at one place costs, but for the half second beside it."""
@@ -42,7 +42,7 @@ def long(tmp_path_factory: pytest.TempPathFactory) -> Path:
         world = World(config, recorder=recorder)
         world.drive(0.5, 0.2, seconds=1.0)
         for second in range(SECONDS):
-            if second % 50 == 25:
+            if second % 25 == 12:
                 settings = b'{"settings": {"limits.linear_speed": %.1f}}' % dice.uniform(0.5, 0.9)
                 assert world.call("set", settings).success
             speed = 0.0 if second % 30 < 5 else dice.uniform(-0.8, 0.8)

@@ -57,6 +57,7 @@ def test_heading_is_ten_times_better_than_with_the_geometric_track(way: str) -> 
         assert better >= 10
 
 
+@pytest.mark.variations(3)
 @each_way
 def test_a_perfect_robot_is_found_exactly(way: str) -> None:
     gyro, places = WAYS[way]

@@ -319,7 +319,7 @@ def test_the_average_rate_is_the_configured_one(
     assert abs(len(times) - min(hz or most, most) * 10) <= 1
 
 
-@settings(max_examples=100)
+@settings(max_examples=30)
 @given(st.sampled_from([10, 20, 25, 50]), st.randoms(use_true_random=False))
 def test_steps_a_little_early_or_late_do_not_make_the_intervals_uneven(hz: int, dice: Any) -> None:
     for key, config in (("odom", rates(odom=float(hz))), ("state", CONFIG)):
