@@ -62,16 +62,24 @@ def holder_of(path: str) -> Holder | None:
     return last
 
 
+def is_pty(path: str) -> bool:
+    return os.major(_number(path)) in PTY_MAJORS
+
+
 def master_of(path: str) -> Holder | None:
-    """Return the process at the other end of the pty `path`, such as a simulator, or None."""
+    """Return a process at the other end of the pty `path`, such as a simulator, or None."""
+    return next(masters_of(path), None)
+
+
+def masters_of(path: str) -> Iterator[Holder]:
+    """Yield each process at the other end of the pty `path`."""
+    if not is_pty(path):
+        return
     wanted = _number(path)
-    if os.major(wanted) not in PTY_MAJORS:
-        return None
     index = f"tty-index:\t{os.minor(wanted) + 256 * (os.major(wanted) - PTY_MAJORS[0])}"
     for descriptor in _open_devices("/ptmx"):
         if index in descriptor.fdinfo() and (holder := _holder(descriptor.process)) is not None:
-            return holder
-    return None
+            yield holder
 
 
 def name_of(pid: int) -> str:

@@ -69,10 +69,23 @@ def examine(
     overrides: dict[str, dict[str, object]],
     find_address: Callable[[Config], Address] = address_of,
 ) -> Iterator[Finding]:
-    """Yield all findings of the doctor. Raises `UsageError` for an invalid endpoint.
+    """Yield all findings of the doctor, and each remedy once. Raises `UsageError`.
 
-    `overrides` replace values of the file by table and key. `where` is its path.
+    `overrides` replace values of the file by table and key. `where` is its path. An invalid
+    endpoint is a usage error.
     """
+    told = {""}
+    for finding in _findings(where, text, overrides, find_address):
+        yield replace(finding, mend="") if finding.mend in told else finding
+        told.add(finding.mend)
+
+
+def _findings(
+    where: str,
+    text: bytes,
+    overrides: dict[str, dict[str, object]],
+    find_address: Callable[[Config], Address],
+) -> Iterator[Finding]:
     try:
         config = parse(text, overrides)
     except ConfigError as error:

@@ -13,7 +13,8 @@ from acsard.core.messages.diagnostics import SIMULATOR_ADVICE
 from acsard.core.values import NS_PER_S, Ns
 from acsard.host import clock, real_time
 from acsard.host.kernel_counters import Kernel, Reading
-from acsard.host.processes import holders, is_running, master_of
+from acsard.host.port_access import advice_about, denial
+from acsard.host.processes import holders, is_running
 from acsard.machine import versions
 from acsard.machine.finding import Finding, Level
 from acsard.machine.serial_ports import BOARDS, serial_devices
@@ -167,16 +168,15 @@ def serial_port(path: str, simulated: bool) -> Iterator[Finding]:
         yield Finding("port", "failure", f"{path} is not a serial device", mend)
         return
     yield _permission(path)
-    # The other end of a pty is a simulator of the board, which may hold this end open, too.
-    board = master_of(path)
     for holder in holders(path):
         text = f"{path} is in use by {holder.name} (pid {holder.pid})"
-        if holder == board:
+        # The other end of a pty is a simulator of the board, which may hold this end open, too.
+        mend = advice_about(path, holder)
+        if not mend:
             yield Finding("port", "ok", f"{text}, which simulates the board")
         elif holder.name == "acsard":
             yield Finding("port", "ok", text)
         else:
-            mend = f"end that program (`kill {holder.pid}`), or let it use another port"
             yield Finding("port", "failure", text, mend)
     yield from _hardware(Path(os.path.realpath(path)).name)
 
@@ -207,13 +207,4 @@ def _hardware(name: str) -> Iterator[Finding]:
 def _permission(path: str) -> Finding:
     if os.access(path, os.R_OK | os.W_OK):
         return Finding("port", "ok", f"{path} is readable and writable")
-    try:
-        group = Path(path).group()
-    except KeyError:
-        group = str(os.stat(path).st_gid)
-    mend = f"run `sudo usermod -aG {group} $USER`, then log in again"
-    if group == "dialout":
-        mend += " (the systemd service does not need this, because its unit names the group)"
-    return Finding(
-        "port", "failure", f"{path} belongs to group {group}, but you are not in it", mend
-    )
+    return Finding("port", "failure", *denial(path))

@@ -8,10 +8,13 @@ import fcntl
 import itertools
 import os
 import pty
+import shutil
+import subprocess
 import termios
 import threading
 import tty
 from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import get_args
 
 import pytest
@@ -47,8 +50,7 @@ def path() -> Iterator[str]:
         (errno.ENOENT, Exit.NO_PORT, "does not exist"),
         (errno.ENXIO, Exit.NO_PORT, "does not exist"),
         (errno.ENOTTY, Exit.NO_PORT, "is not a serial port"),
-        (errno.EACCES, Exit.NO_PERMISSION, "dialout"),
-        (errno.EPERM, Exit.NO_PERMISSION, "dialout"),
+        (errno.EACCES, Exit.NO_PORT, "does not exist any more"),
         (errno.EBUSY, Exit.IN_USE, "in use by another process"),
         (errno.EAGAIN, Exit.IN_USE, "in use by another process"),
         (errno.EIO, Exit.FAILURE, "the driver of the serial port did not answer"),
@@ -75,6 +77,32 @@ def test_a_port_is_opened_and_changed_at_each_baud_rate(path: str, baud_rate: in
     assert termios.tcgetattr(device.fileno())[:2] == raw[:2]
     close(device, wait_s=1.0)
     device.close()
+
+
+@pytest.mark.skipif(os.getuid() != 0, reason="only root gives a file to any group")
+@each(
+    ("group", "mode", "console", "words"),
+    [
+        (54321, 0o660, False, "belongs to group 54321, but you are not in it; run `sudo usermod"),
+        (0, 0o660, False, "belongs to group root, and you are in it, but something else"),
+        (20, 0o600, False, "has the mode 600, so no group may open it; run `sudo chmod g+rw"),
+        (5, 0o600, True, "a login console (agetty) probably uses it; on a Raspberry Pi"),
+        (5, 0o620, True, "serial-getty@ttyAMA0`"),
+    ],
+)
+def test_a_device_without_permission_is_named_with_what_is_really_so(
+    tmp_path: Path, group: int, mode: int, console: bool, words: str
+) -> None:
+    path, program = tmp_path / "ttyAMA0", tmp_path / "agetty"
+    path.touch()
+    os.chown(path, 0, group)
+    path.chmod(mode)
+    shutil.copy("/bin/sleep", program)
+    with subprocess.Popen([program if console else "/bin/true", "9"]) as getty:
+        refused = refusal(str(path), OSError(errno.EACCES, "Permission denied"))
+        getty.kill()
+    assert refused.code is Exit.NO_PERMISSION
+    assert words in str(refused)
 
 
 def test_an_empty_read_is_not_a_hang_up_and_a_hang_up_is_reported() -> None:

@@ -192,7 +192,9 @@ def _link(config: Config, snapshot: Snapshot) -> Iterator[Finding]:
     if status.link == "up":
         yield OK, "up", ""
     else:
-        why = f": {status.reason}" if _is_reason(status) else ""
+        # The advice says more about the check.
+        reason = status.reason.removesuffix(" `acsard mcu check` finds out more").rstrip(";")
+        why = f": {reason}" if _is_reason(status) else ""
         yield ERROR, f"{status.link}{why}", advice
     if snapshot.pose_doubt:
         yield WARN, sentence(snapshot.pose_doubt).text, ""

@@ -17,6 +17,7 @@ from serial.serialposix import BOTHER, TCGETS2, TCSETS2
 from acsard.core.values import Ns
 from acsard.host import clock
 from acsard.host.errors import InUseError, MendableError, NoPortError, NotPermittedError
+from acsard.host.port_access import GETTY, console_advice, denial
 from acsard.host.processes import holder_of
 from acsard.host.threads import NoThreadError, Worker
 
@@ -164,14 +165,19 @@ def refusal(path: str, error: OSError) -> MendableError:
         case errno.ENOTTY | errno.EISDIR:
             return NoPortError(f"{path} is not a serial port; name another port ({_LISTED})")
         case errno.EACCES | errno.EPERM:
+            try:
+                text, mend = denial(path)
+            except OSError:  # it has gone since
+                return NoPortError(f"{path} does not exist any more ({_LISTED})")
             return NotPermittedError(
-                f"no permission to open {path}; add your user to the device's group (`sudo usermod "
-                "-aG dialout $USER`), then log in again. The systemd service of acsard is in the "
-                "group dialout already: if the service has no permission, the device belongs to "
-                "another group, or acsard.service does not allow this type of device"
+                f"no permission: {text}; {mend}. If the systemd service of acsard has no "
+                "permission, acsard.service may not allow this type of device"
             )
         case errno.EBUSY | errno.EAGAIN:
             holder = holder_of(path)
+            if holder and holder.name == GETTY:
+                advice = console_advice(path)
+                return InUseError(f"{path} is in use by a login console ({GETTY}); {advice}")
             owner = f"process {holder.pid}" if holder else "another process"
             return InUseError(
                 f"{path} is in use by {owner}; stop that process first (`systemctl stop acsard` if "
