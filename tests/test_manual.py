@@ -24,7 +24,7 @@ QUESTIONS = {
     ),
     "Which wire goes to pin 5?": ("howto/wire.md", "| 5 (PE3) |"),
     "What does my own firmware send?": ("reference/line.md", "ap12.50"),
-    "How do I stop the robot, and release the stop?": ("explanation/latches.md", "srv/clear"),
+    "How do I stop the robot, and release the stop?": ("howto/stop.md", "acsard call clear"),
     "What must my program send before it drives?": ("explanation/arming.md", "zero"),
     "How do I drive from Go?": ("howto/languages.md", "go run"),
     "What is the default of `wheel_radius`?": ("reference/settings.md", "`wheel_radius`"),
