@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import random
 
 import pytest
 from msgspec import json
@@ -16,9 +15,8 @@ from acsard.core.config.settings import (
 )
 from acsard.core.messages.schema import DiagnosticArray
 from acsard.core.simulator import protocol
-from acsard.core.simulator.fake_mcu import FakeMcu
-from acsard.core.values import NS_PER_S, Instant, Received
-from tests.scenarios.world import VirtualPort, World
+from acsard.core.values import NS_PER_S
+from tests.scenarios.world import World
 
 MS = 1_000_000
 ZERO = b"ap00.00,bp00.00,cp00.00,dp00.00"
@@ -138,21 +136,6 @@ def test_a_reset_is_found_by_the_clock_when_its_announcement_is_lost() -> None:
     assert world.state.x - x < 0.05
 
 
-def test_another_mcu_on_the_port_without_the_check_does_not_move() -> None:
-    world = started(config(counts=3200))
-    world.drive(0.5, seconds=1.0)
-    x = world.state.x
-    world.port.unplug()
-    world.run(0.5)
-    world.mcu = FakeMcu(world.config, world.now_ns)
-    world.port.plug(world.mcu)
-    with world.mcu.no_check():
-        world.hold(0.5, seconds=1.0)
-        assert not moving(world.lines())
-        assert world.state.code == "no_checksum"
-    assert world.state.x == pytest.approx(x, abs=0.02)
-
-
 # damage
 
 
@@ -177,19 +160,6 @@ def test_a_burst_of_damaged_replies_stops_and_goes_on() -> None:
     assert off_by(world) < 0.001
 
 
-@pytest.mark.slow
-def test_noise_never_talks_an_mcu_out_of_the_check() -> None:
-    world = started(config())
-    world.drive(0.5, seconds=1.0)
-    for _ in range(5):
-        with world.mcu.no_check():
-            world.hold(0.5, seconds=2.0)
-            assert stopped(world)
-            assert world.state.code == "no_checksum"
-        world.run(0.3)
-        assert check_of(world) == "checked"
-
-
 @pytest.mark.variations(3)
 @pytest.mark.parametrize("every", [2, 3, 7])
 def test_bit_errors_both_ways_change_no_speed(every: int) -> None:
@@ -206,69 +176,6 @@ def test_bit_errors_both_ways_change_no_speed(every: int) -> None:
 
 
 # counts
-
-
-def lossy_drive(check: str, counts: int) -> World:
-    """Drive along curves while 20 % of the lines are lost in each direction. Return the world."""
-    world = started(config(check, counts))
-    with world.mcu.lost_replies(every=5), world.mcu.lost_commands(every=5):
-        for turn in (0.0, 0.6, -0.6, 0.3, 0.0):
-            world.drive(0.5, turn, seconds=4.0)
-        world.send(0.0)
-        world.run(1.5)
-    assert "fault" not in {event.name for event in world.events}
-    assert world.mcu.vehicle.pose.x > 5.0
-    return world
-
-
-@pytest.mark.slow
-def test_with_counts_lost_lines_lose_no_distance() -> None:
-    by_speeds, by_counts = off_by(lossy_drive("off", 0)), off_by(lossy_drive("on", 3200))
-    print(f"\n  20 % lost: {by_speeds:.4%} off by speeds, {by_counts:.4%} by counts")
-    assert by_counts < 0.001
-
-
-class LatePort(VirtualPort):
-    """A port whose bytes the daemon reads in batches and up to 60 ms late, as on a busy host."""
-
-    world: World
-    dice = random.Random(5)
-    ready_ns = 0
-    held: list[bytes]
-
-    def feed(self, received: Received) -> None:
-        self.held.append(received.data)
-
-    def take(self, late: Instant | None = None) -> tuple[Received, ...]:
-        now = self.world.instant
-        if now.mono_ns < self.ready_ns or not self.held:
-            return ()
-        chunk = Received(now, b"".join(self.held))
-        self.held.clear()
-        self.ready_ns = now.mono_ns + self.dice.choice((0, 3, 20, 60)) * MS
-        return (chunk,)
-
-
-def jittery_drive(check: str, counts: int) -> World:
-    world = World(config(check, counts))
-    port = LatePort(*world.port._opening)
-    port.world, port.held = world, []
-    port.plug(world.mcu)
-    world.port = world.loop._port = port
-    world.run(0.5)
-    for turn in (0.8, -0.8, 1.5, -1.5, 0.4):
-        world.drive(0.5, turn, seconds=3.0)
-    world.send(0.0)
-    world.run(1.5)
-    assert "fault" not in {event.name for event in world.events}
-    return world
-
-
-@pytest.mark.slow
-def test_with_counts_late_reads_of_the_host_do_not_bend_the_pose() -> None:
-    by_speeds, by_counts = off_by(jittery_drive("off", 0)), off_by(jittery_drive("on", 3200))
-    print(f"\n  late reads: {by_speeds:.4%} off by speeds, {by_counts:.4%} by counts")
-    assert by_counts < min(0.001, by_speeds)
 
 
 @pytest.mark.slow
@@ -290,18 +197,6 @@ def test_counts_and_clock_wrap_in_a_long_drive_without_a_jump_of_the_pose() -> N
     assert math.dist((state.x, state.y), (true.x, true.y)) < 0.001
     assert math.remainder(state.yaw - true.yaw, math.tau) == pytest.approx(0.0, abs=0.001)
     assert world.state.counters.get("line_count_leap", 0) == 0
-
-
-@pytest.mark.slow
-def test_a_stall_of_the_host_loses_no_distance_with_counts() -> None:
-    world = started(config("on", 3200))
-    world.drive(0.5, seconds=1.0)
-    world.send(0.5)
-    world.stall(0.2)
-    world.hold(0.5, seconds=0.5)
-    world.send(0.0)
-    world.run(1.5)
-    assert off_by(world) < 0.001
 
 
 # anything

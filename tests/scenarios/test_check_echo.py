@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from contextlib import nullcontext
-from itertools import repeat
 
 import pytest
 from msgspec.structs import replace
@@ -12,10 +11,8 @@ from acsard.core.config.settings import (
     Config,
     LimitsConfig,
     McuConfig,
-    SimConfig,
 )
 from acsard.core.simulator.fake_mcu import FakeMcu
-from tests.each import each
 from tests.scenarios.world import World
 
 MS = 1_000_000
@@ -91,27 +88,6 @@ def test_an_echo_beside_a_board_is_never_driven(period: float, latency_ms: int) 
         assert moving([line for _, line in world.port.sent]) == []
 
 
-@pytest.mark.slow
-@each("lag", [0.01, 0.02, 0.03, 0.05])
-@each("deceleration", [0.6, 1.0, 3.0])
-def test_an_ideal_board_whose_motors_lag_by_whole_periods_keeps_its_link(
-    lag: float, deceleration: float
-) -> None:
-    limits = replace(
-        LimitsConfig(), linear_deceleration=deceleration, linear_stop_deceleration=deceleration
-    )
-    sim = SimConfig(motor_time_constant=lag, encoder_counts=1_000_000)
-    world = World(Config(limits=limits, sim=sim))
-    world.mcu._processing = repeat(1.3)  # type: ignore[assignment]
-    world.run(0.3)
-    for speed in (0.8, -0.4):
-        # A command moves the times of the lines, so only the ramp down without one is steady.
-        world.drive(speed, seconds=1.0)
-        world.run(2.0)
-    assert world.state.link == "up"
-    assert "line_echo" not in world.state.counters
-
-
 @pytest.mark.variations(4)
 @pytest.mark.parametrize("kind", [Echo, HalfDuplex])
 @pytest.mark.parametrize("acceleration", [1.0, 100.0])
@@ -132,18 +108,3 @@ def test_an_echo_that_begins_during_a_drive_ends_the_link_when_the_speed_changes
     world.drive(0.5, seconds=10.0)
     assert world.state.code == "echo"
     assert moving([line for _, line in list(world.port.sent)[sent:]]) == []
-
-
-@pytest.mark.variations(3)
-@pytest.mark.parametrize("kind", [Echo, HalfDuplex])
-@pytest.mark.parametrize(("check", "counts"), [("off", 0), ("on", 0), ("on", 3200)])
-def test_an_echo_that_begins_during_a_steady_drive_ends_the_link(
-    check: str, counts: int, kind: type[FakeMcu]
-) -> None:
-    world = World(config(check, counts))
-    world.run(0.5)
-    world.drive(0.3, seconds=3.0)
-    world.mcu.__class__ = kind  # TX now touches RX
-    world.hold(0.3, seconds=1.5)
-    assert (world.state.link, world.state.code) == ("stale", "echo")
-    assert moving([world.port.sent[-1][1]]) == []

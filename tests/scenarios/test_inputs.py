@@ -71,17 +71,6 @@ def test_stamps_that_zenoh_replaces_are_only_counted(world: World) -> None:
     assert world.state.counters["stamps_replaced"] == 40
 
 
-def test_set_pose_and_reset_odometry_move_the_pose_and_not_the_robot(world: World) -> None:
-    reply = world.call("set_pose", msgspec.json.encode({"x": 1.0, "y": -2.0, "yaw": 4.0}))
-    assert reply.success
-    state = world.state
-    assert (state.x, state.y) == (1.0, -2.0)
-    assert state.yaw == pytest.approx(4.0 - 2 * 3.141592653589793)
-    assert world.call("reset_odometry").success
-    assert (world.state.x, world.state.y, world.state.yaw) == (0.0, 0.0, 0.0)
-    assert not world.call("set_pose", b'{"x": 1}').success
-
-
 def test_a_query_on_the_wildcard_calls_no_service(world: World) -> None:
     for service in ("stop", "clear", "deactivate"):
         assert world.ask(f"srv/{service}", asked="**") == []
@@ -123,6 +112,3 @@ def test_after_a_stall_a_waiting_command_without_a_stamp_does_not_drive(world: W
     assert world.state.mode == "ready"
     world.hold(0.5, seconds=0.5)
     assert world.state.mode == "driving"
-
-
-# several people on one source, and networks that delay samples

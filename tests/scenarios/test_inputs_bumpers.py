@@ -10,7 +10,6 @@ from acsard.core.config.settings import (
     Config,
     Place,
     SafetyConfig,
-    SimConfig,
 )
 from tests.scenarios.test_inputs_estop import MOST, Watch, out_of
 from tests.scenarios.world import World
@@ -121,26 +120,3 @@ def test_a_limiting_bumper_stops_the_robot_within_a_period_and_allows_only_retre
             assert world.newest == 0
     assert slowest_ns <= world.period_ns
     assert (retreats > 0) == (sign != 0)
-
-
-def test_a_board_that_falls_silent_about_its_bumpers_stops_the_robot() -> None:
-    world = World(Config(safety=AWAY.safety, sim=SimConfig(faults=("bumpers_silent=2:3",))))
-    world.run(0.2)
-    world.drive(0.5, seconds=1.7)
-    assert world.state.mode == "driving"
-    world.hold(0.5, seconds=0.7)
-    assert (world.state.mode, world.state.bumpers) == ("stopped", [True] * 4)
-    assert not world.call("clear").success
-    world.run(3.0)
-    assert (world.state.mode, world.state.bumpers) == ("stopped", [False] * 4)
-    assert world.call("clear").success
-
-
-def test_a_robot_with_places_waits_for_its_bumpers_and_then_becomes_ready() -> None:
-    world = World(STOP)
-    world.run(1.0)
-    assert (world.state.mode, world.state.link, world.state.bumpers) == ("waiting", "up", None)
-    assert world.state.code == "bumpers_missing"
-    with world.mcu.bumpers():
-        world.run(0.2)
-        assert world.state.mode == "ready"

@@ -11,11 +11,9 @@ from acsard.core.config.settings import (
     Config,
     EstopUse,
     SafetyConfig,
-    SimConfig,
 )
-from acsard.core.motion.latches import after_restart
 from acsard.core.simulator.fake_mcu import FakeMcu
-from acsard.core.values import NS_PER_S, Latches
+from acsard.core.values import NS_PER_S
 from tests.scenarios.world import World
 from tests.stepped import Outputs
 
@@ -118,66 +116,6 @@ def test_each_press_is_a_zero_line_within_a_period_and_no_release_moves_the_robo
             assert world.state.code == "neutral"
     assert slowest_ns <= world.period_ns
     print(f"\n{mode}: {count} presses, first zero line after at most {slowest_ns / 1e6:.2f} ms")
-
-
-def test_a_robot_that_is_rolled_by_hand_after_a_press_latches_no_fault() -> None:
-    # The robot drove at the press, so its wheels turned by command before they had no power.
-    world = World()
-    with world.mcu.estop():
-        world.run(0.5)
-        world.drive(0.8, seconds=1.5)
-        with world.mcu.estop_pressed(0.0, 4.0):
-            world.run(3.0)
-            assert max(map(abs, world.state.wheels)) == 0.0
-            with world.mcu.pushed(0.5):
-                world.run(2.5)
-    assert world.state.mode == "stopped"
-    assert world.state.counters["uncommanded_motion"] > 0
-
-
-@pytest.mark.slow
-def test_a_board_that_falls_silent_about_its_button_stops_the_robot() -> None:
-    world = World(Config(sim=SimConfig(faults=("estop_silent=2:3",))))
-    world.run(0.2)
-    world.drive(0.5, seconds=1.7)
-    assert world.state.mode == "driving"
-    world.hold(0.5, seconds=0.7)
-    assert (world.state.mode, world.state.emergency_stop) == ("stopped", "silent")
-    assert not world.call("clear").success
-    world.run(3.0)
-    assert (world.state.mode, world.state.emergency_stop) == ("stopped", "released")
-    assert world.call("clear").success
-
-
-def test_a_robot_that_needs_the_input_waits_for_it_and_then_becomes_ready() -> None:
-    world = World(Config(safety=SafetyConfig(estop="required")))
-    world.run(1.0)
-    assert (world.state.mode, world.state.link) == ("waiting", "up")
-    assert world.state.code == "emergency_stop_missing"
-    with world.mcu.estop():
-        world.run(0.2)
-        assert world.state.mode == "ready"
-
-
-def test_a_press_survives_a_restart_of_the_daemon_and_of_the_board() -> None:
-    world = World()
-    with world.mcu.estop():
-        world.run(0.3)
-        with world.mcu.estop_pressed(0.0, 0.0):
-            world.run(0.1)
-            world.mcu.reset(world.now_ns, deaf_ns=NS_PER_S // 5)
-            world.run(0.5)
-            assert world.state.emergency_stop == "pressed"
-        latches: Latches = world.loop.robot.latches
-    again = World(latches=after_restart(latches))
-    with again.mcu.estop():
-        again.run(0.3)
-        again.hold(0.5, seconds=0.5)
-        assert again.state.mode == "stopped"
-        assert again.state.code == "emergency_stop"
-        assert again.call("clear").success
-        again.drive(0.5, seconds=0.5)
-        assert again.state.mode == "driving"
 
 
 @pytest.mark.parametrize("boot_s", [0.0, 2.0])

@@ -6,7 +6,6 @@ from collections.abc import Callable
 
 import pytest
 
-from acsard.core.config.settings import CommandsConfig, Config, Source
 from acsard.core.values import NS_PER_S
 from tests.each import each
 from tests.scenarios.speakers import FOREIGN, STAMPED, Message, Speaker, Way, moved, over
@@ -150,28 +149,6 @@ def test_a_sender_drives_on_as_soon_as_it_is_prompt_again(way: Way) -> None:
     assert world.state.mode == "driving"
 
 
-@each("way", STAMPED)
-def test_a_zero_brakes_immediately_while_the_delay_of_its_sender_is_unproven(way: Way) -> None:
-    source = Source("app", 50, 2.0)
-    world = World(Config(commands=CommandsConfig(sources=(source,))))
-    world.run(0.5)
-    speaker = Speaker(world, way)
-    for n in range(60):
-        message = speaker.message(0.0 if n < 30 else 1.0)
-        world.run(0.06)
-        speaker.deliver(message)
-        world.run(0.04)
-    assert (outputs := world.outputs) is not None
-    assert outputs.applied.linear == 1.0
-    # The delay falls by 60 ms, so the daemon does not know any more whether these are prompt.
-    speaker.send(1.0)
-    world.run(0.1)
-    speaker.send(0.0)
-    world.run(0.05)
-    assert (outputs := world.outputs) is not None
-    assert outputs.applied.linear < 1.0
-
-
 # clocks that are set
 
 
@@ -246,26 +223,6 @@ def test_stamps_that_are_no_times_are_named_and_never_drive_for_long(way: Way, k
 # order
 
 
-@pytest.mark.slow
-@each("way", STAMPED)
-def test_an_older_command_that_arrives_after_a_newer_one_is_not_obeyed(way: Way) -> None:
-    """A delayed speed that arrives after a newer zero does not move the robot: it was 0.26 m."""
-    world = quiet()
-    speaker = Speaker(world, way)
-    speaker.hold(0.0, 7.0)
-    speaker.hold(0.4, 1.0)
-    assert world.state.mode == "driving"
-    older = speaker.message(0.9)
-    world.run(0.02)
-    speaker.send(0.0)
-    world.run(0.1)
-    before = world.lines()[-1]
-    speaker.deliver(older)
-    world.run(0.1)
-    assert world.lines()[-1] <= before
-    assert world.state.counters["command_not_newer"] >= 1
-
-
 @pytest.mark.parametrize("way", STAMPED)
 def test_a_command_that_comes_again_and_again_is_obeyed_once(way: Way) -> None:
     world = quiet()
@@ -276,21 +233,3 @@ def test_a_command_that_comes_again_and_again_is_obeyed_once(way: Way) -> None:
         speaker.deliver(again)
         world.run(0.05)
     assert world.state.mode == "ready"
-
-
-def test_numbers_alone_keep_the_order_too() -> None:
-    world = quiet()
-    sent = []
-    for number in range(60):
-        sent.append(number)
-        payload = b'{"linear": {"x": %f}, "angular": {}}' % (0.4 if number > 30 else 0.0)
-        world.put("cmd/app", payload, attachment=b'{"sender": "a", "sequence": %d}' % number)
-        world.run(0.05)
-    assert world.state.mode == "driving"
-    world.run(1.5)
-    since_ns = world.now_ns
-    payload = b'{"linear": {"x": 0.4}, "angular": {}}'
-    world.put("cmd/app", payload, attachment=b'{"sender": "a", "sequence": 40}')
-    world.run(0.3)
-    assert not moved(world, since_ns)
-    assert world.state.counters["command_not_newer"] == 1

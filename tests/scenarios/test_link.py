@@ -52,17 +52,6 @@ def test_after_replugging_nothing_moves_before_a_zero(world: World) -> None:
     assert world.state.mode == "driving"
 
 
-def test_odometry_goes_on_without_a_jump_after_replugging(world: World) -> None:
-    world.drive(0.5, seconds=1.0)
-    world.port.unplug()
-    world.run(3.0)
-    before = world.state.x
-    world.mcu = FakeMcu(world.config, world.now_ns)
-    world.port.plug(world.mcu)
-    world.run(1.0)
-    assert world.state.x == pytest.approx(before, abs=1e-9)
-
-
 @pytest.mark.slow
 def test_a_silent_mcu_gets_zeros_only_at_ten_hertz(world: World) -> None:
     world.drive(0.5, seconds=1.0)
@@ -74,17 +63,6 @@ def test_a_silent_mcu_gets_zeros_only_at_ten_hertz(world: World) -> None:
     lines = [line for _, line in list(world.port.sent)[sent:]]
     assert 19 <= len(lines) <= 21
     assert set(lines) == {ZERO}
-
-
-def test_odometry_stands_while_the_mcu_is_silent_and_grows_less_certain(world: World) -> None:
-    world.drive(0.5, seconds=1.0)
-    with world.mcu.mute():
-        world.run(0.2)
-        x, known = world.state.x, world.odom.pose.covariance[0]
-        world.run(2.0)
-        assert world.state.x == x
-    world.run(0.5)
-    assert world.odom.pose.covariance[0] > known
 
 
 def test_a_short_silence_only_ramps_up_again(world: World) -> None:
@@ -122,14 +100,6 @@ def test_a_reset_mcu_does_not_move_before_neutral(world: World) -> None:
     assert world.state.counters["line_malformed"] >= 1
 
 
-def test_noise_costs_at_most_the_line_it_hits(world: World) -> None:
-    before = world.state.counters["lines"]
-    with world.mcu.noise(b"\x00\xff~\n"):
-        world.run(1.0)
-    assert world.state.link == "up"
-    assert world.state.counters["lines"] - before >= 98
-
-
 def test_an_mcu_that_speaks_unprompted_at_ten_hertz_can_drive() -> None:
     world = World(Config(mcu=McuConfig(reply_period=0.1)))
     with world.mcu.free_running(0.1):
@@ -160,19 +130,6 @@ def test_the_trailing_comma_option_reaches_the_last_wheel_of_a_comma_latched_mcu
         assert world.mcu.vehicle.set_points == [10.0, 10.0, 10.0, 10.0]
         world.run(2.0)
         assert world.mcu.vehicle.set_points == [0.0, 0.0, 0.0, 0.0]
-
-
-def test_blocked_output_is_superseded_and_never_delivered_late(world: World) -> None:
-    world.drive(0.5, seconds=1.0)
-    world.port.blocked = True
-    world.hold(0.5, seconds=0.2)
-    # A zero that did not leave is sent again in the next period, and not with the next 10 Hz.
-    # Four commands came between two periods.
-    assert 19 <= world.state.counters["lines_superseded"] <= 26
-    before = len(world.mcu.heard)
-    world.port.blocked = False
-    world.run(0.02)
-    assert len(world.mcu.heard) - before <= 2
 
 
 @pytest.mark.parametrize("seconds", [2.0, pytest.param(600.0, marks=pytest.mark.slow)])
@@ -276,12 +233,6 @@ def test_a_stall_of_this_computer_does_not_stop_the_robot_without_a_ramp(stall: 
         world.stall(stall)
         world.hold(0.8, seconds=0.3)
         assert b"ap00.00" not in b"".join(line for _, line in list(world.port.sent)[lines:])
-
-
-def test_the_mcu_stops_the_motors_by_itself_when_the_host_dies(world: World) -> None:
-    world.drive(0.5, seconds=1.0)
-    world.mcu.advance(world.now_ns + 400_000_000)
-    assert world.mcu.vehicle.set_points == [0.0] * 4
 
 
 @pytest.mark.slow

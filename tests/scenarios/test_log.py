@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import get_args
-
 import msgspec
 import pytest
 
@@ -106,31 +104,6 @@ def test_a_put_on_stop_is_reported_with_its_name_or_the_session_that_stamped_it(
     ]
 
 
-# the changes and their reasons
-
-
-def test_a_drive_is_reported_as_changes_of_mode_and_commander(world: World) -> None:
-    world.drive(0.5, seconds=0.5)
-    world.run(1.0)
-    assert [event.text for event in events_named(world, "mode")] == [
-        "ready -> driving: commanded by app",
-        "driving -> ready: waiting for a command: no source has sent a usable one within its "
-        "timeout",
-    ]
-    assert [event.text for event in events_named(world, "commander")] == [
-        f"no sender -> app ({public_name('somebody')})"
-    ]
-
-
-def test_a_lost_cable_is_reported_as_a_link_event_and_a_mode_event(world: World) -> None:
-    world.drive(0.5, seconds=0.5)
-    world.events.clear()
-    world.port.unplug()
-    world.run(0.1)
-    assert [event.name for event in world.events] == ["link_down", "mode"]
-    assert "driving -> waiting: the serial port is closed" in world.events[1].text
-
-
 # never too much
 
 
@@ -154,26 +127,6 @@ def test_refused_commands_are_one_log_line_a_second_that_counts_them_by_reason(
     assert "100 x wrong_shape" in lines[2].text
 
 
-def test_missed_periods_are_one_log_line_a_second_that_counts_all(world: World) -> None:
-    for _ in range(20):
-        world.stall(0.05)
-        world.run(0.05)
-    world.run(1.1)
-    lines = events_named(world, "missed_periods")
-    assert len(lines) <= 4
-    assert counted(lines) == world.state.counters["missed_periods"] > 60
-
-
-def test_noise_on_the_wire_is_one_log_line_a_second_that_counts_all(world: World) -> None:
-    with world.mcu.noise():
-        world.run(5.0)
-    world.run(1.1)
-    lines = events_named(world, "lines_rejected")
-    assert len(lines) <= 7
-    assert counted(lines) == world.state.counters["line_malformed"] > 20
-    assert lines[1].text.startswith(f"{lines[1].count} x malformed; the last: ")
-
-
 # at the end
 
 
@@ -189,29 +142,3 @@ def test_the_totals_are_the_driven_distance_and_the_counted_events(world: World)
     assert totals["metres"] == pytest.approx(2.0, rel=0.05)  # there and back
     assert totals["commands"] == 84
     assert totals["lines"] == world.state.counters["lines"]
-
-
-def test_every_event_name_is_in_the_declared_set(world: World) -> None:
-    with world.mcu.noise():
-        world.drive(0.5, seconds=1.0)
-    world.mcu.reset(world.now_ns)
-    world.run(3.0)
-    for service in VERBS:
-        call(world, service.removeprefix("srv/"))
-    world.stall(0.5)
-    world.run(2.0)
-    names = {event.name for event in world.events}
-    assert len(names) > 10
-    assert names <= set(get_args(EventName))
-
-
-def test_missed_periods_say_how_late_the_daemon_was(world: World) -> None:
-    world.run(0.2)
-    world.events.clear()
-    world.stall(0.05)
-    world.run(1.1)
-    (late,) = events_named(world, "missed_periods")
-    assert (
-        late.text
-        == "4 x missed: late by 0.04 s: no control step ran in 4 successive control periods"
-    )

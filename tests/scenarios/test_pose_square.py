@@ -99,20 +99,6 @@ def test_a_square_ends_where_the_raw_counter_says(link: str, counts: int, stalls
     assert far <= 1.05 * raw_far + (0.03 if fine else 0.005)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize(("counts", "coarse"), [(16, True), (96, True), (3200, False)])
-def test_state_counts_the_lines_of_coarse_encoders_whose_resolution_is_unknown(
-    counts: int, coarse: bool
-) -> None:
-    world = World(Config(sim=SimConfig(encoder_counts=counts)))
-    world.run(0.5)
-    for turn in (0.0, 1.0, -1.0):
-        world.drive(0.5, turn, 2.0)
-    assert world.state.encoder_counts == [0] * 4
-    assert (world.state.counters.get("coarse_encoder_lines", 0) > 300) is coarse
-    assert coarse or "coarse_encoder_lines" not in world.state.counters
-
-
 def test_state_reports_the_configured_counts_if_the_speeds_agree_with_them() -> None:
     mcu = McuConfig(encoder_counts=16)
     world = World(Config(sim=SimConfig(encoder_counts=16), mcu=mcu))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import random
 from contextlib import ExitStack, nullcontext
+from typing import Literal
 
 import numpy as np
 import pytest
@@ -248,3 +249,35 @@ def test_with_the_mcu_s_counts_bursts_of_lost_lines_cost_nothing() -> None:
     mcu = McuConfig(link_check="on", encoder_counts=COUNTS)
     config = Config(sim=SimConfig(encoder_counts=COUNTS), mcu=mcu)
     assert Drive(config, reports=False).error(lost=0.3) < 0.01
+
+
+@pytest.mark.variations(24)
+@pytest.mark.parametrize("check", ["off", "on"])
+@pytest.mark.parametrize("lag_s", [0.05, 0.15])
+@pytest.mark.parametrize("silence_s", [0.12, 0.15, 0.19, 0.3])
+@pytest.mark.parametrize("fault", ["lines to the host", "all lines", "the board"])
+def test_errors_of_many_equal_silences_add_up_within_the_covariance(
+    fault: str, silence_s: float, lag_s: float, check: Literal["off", "on"]
+) -> None:
+    """Each silence has the same cause, so the errors of all have the same sign.
+
+    A loose cable loses the lines to the host or all lines, or the board itself is silent. In most
+    silences the daemon commands rest. `lag_s` is the time constant of the motors.
+    """
+    sim = SimConfig(motor_time_constant=lag_s)
+    made = World(Config(mcu=McuConfig(link_check=check), sim=sim))
+    made.run(2.5)
+    made.drive(0.8, 0.0, 2.0)
+    for _ in range(8):
+        with ExitStack() as fault_over, pytest.MonkeyPatch.context() as cable:
+            if fault == "the board":
+                fault_over.enter_context(made.mcu.mute())
+            else:
+                cable.setattr(made.port, "feed", lambda received: None)
+            if fault == "all lines":
+                cable.setattr(made.mcu, "receive", lambda *line: None)
+            made.hold(0.8, 0.0, silence_s)
+        made.hold(0.8, 0.0, 1.5)
+    made.drive(0.0, 0.0, 1.5)
+    error, variance = made.mcu.vehicle.pose.x - made.state.x, made.odom.pose.covariance[0]
+    assert abs(error) < 2.0 * math.sqrt(variance), f"{error:+.3f} m"

@@ -80,17 +80,6 @@ def test_a_lowered_limit_is_reached_by_the_deceleration_and_never_by_a_jump(worl
     assert speeds[-1][1] == pytest.approx(0.4)
 
 
-def test_a_raised_limit_is_reached_by_the_acceleration() -> None:
-    world = World(Config(limits=LimitsConfig(linear_speed=0.4)))
-    world.run(0.2)
-    world.drive(1.0, seconds=1.0)
-    speeds = applied(world)
-    assert sets(world, limits__linear_speed=1.0).success
-    world.hold(1.0, seconds=1.0)
-    assert max(slopes(speeds)) == pytest.approx(1.0)  # limits.linear_acceleration
-    assert speeds[-1][1] == pytest.approx(1.0)
-
-
 def test_a_setting_is_in_config_and_in_the_log_with_its_client_and_old_value(
     world: World,
 ) -> None:
@@ -179,14 +168,6 @@ def test_a_rate_is_in_force_from_the_next_message_on(world: World) -> None:
     world.run(2.0)
     messages = world.bus.published["odom"]
     assert 19 <= len(messages) <= 21
-
-
-def test_setting_the_present_value_is_answered_with_nothing_changes(world: World) -> None:
-    reply = sets(world, limits__linear_speed=1.0)
-    assert (reply.success, reply.message) == (
-        True,
-        "nothing changed: all settings already have these values",
-    )
 
 
 @pytest.mark.parametrize("via", ["bridge"])

@@ -29,13 +29,6 @@ def test_a_stop_latches_until_clear_and_then_requires_neutral(world: World) -> N
     assert world.state.mode == "driving"
 
 
-def test_a_stop_brakes_harder_than_a_timeout(world: World) -> None:
-    world.drive(0.9, seconds=2.0)
-    world.put("stop", b"")
-    world.run(0.4)
-    assert world.lines()[-1] == b"ap00.00,bp00.00,cp00.00,dp00.00\r\n"
-
-
 def test_a_put_on_stop_stops_the_robot_with_any_payload(world: World) -> None:
     for payload in (b"", b"\x00", b"{}", b"please"):
         world.put("stop", payload)
@@ -90,13 +83,6 @@ def test_the_simulator_built_in_has_no_port_to_release(world: World) -> None:
     assert not world.call("deactivate", RELEASE).success
 
 
-def test_a_robot_stopped_while_inactive_is_inactive_after_clear(world: World) -> None:
-    world.call("deactivate")
-    world.call("stop")
-    world.call("clear")
-    assert world.state.mode == "inactive"
-
-
 def test_shutting_down_ramps_to_rest_and_obeys_no_client(world: World) -> None:
     world.drive(0.9, seconds=2.0)
     world.loop.shutting_down = True
@@ -104,6 +90,3 @@ def test_shutting_down_ramps_to_rest_and_obeys_no_client(world: World) -> None:
     assert world.loop.at_rest
     assert world.state.mode == "shutdown"
     assert not world.call("activate").success
-
-
-# several people on one source, and networks that delay samples

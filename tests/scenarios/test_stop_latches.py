@@ -15,11 +15,9 @@ from acsard.core.incoming.queries import Query
 from acsard.core.messages.cdr import Cdr
 from acsard.core.messages.schema import ServiceReply
 from acsard.core.messages.signature import public_name
-from acsard.core.motion.latches import after_restart
 from acsard.core.ros.attachments import Attachment
 from acsard.core.ros.shapes import Trigger
 from acsard.core.values import NS_PER_S
-from tests.scenarios.speakers import moved
 from tests.scenarios.world import World, naming
 
 JOE = public_name("joe")
@@ -86,19 +84,6 @@ def test_a_clear_read_before_a_later_stop_and_delivered_after_it_leaves_that_sto
     assert world.state.mode == "ready"
 
 
-@pytest.mark.parametrize("via", ["native", "rmw", "bridge"])
-def test_a_plain_clear_is_refused_until_a_stop_was_published_for_two_seconds(
-    world: World, via: Via
-) -> None:
-    call(world, "stop", "joe")
-    world.run(1.0)
-    reply = call(world, "clear", "ann", via=via)
-    assert (reply.success, world.state.mode) == (False, "stopped")
-    world.run(1.05)
-    assert call(world, "clear", "ann", via=via).success
-    assert world.state.mode == "ready"
-
-
 @pytest.mark.parametrize("stall_s", [0.05, 0.16, 0.5, 1.0])
 def test_a_plain_clear_works_on_a_computer_that_stalls_all_the_time(
     world: World, stall_s: float
@@ -113,18 +98,6 @@ def test_a_plain_clear_works_on_a_computer_that_stalls_all_the_time(
         world.run(0.05)
         done += call(world, "clear", "ann", via="rmw").success
     assert done == 8
-
-
-def test_every_stop_has_a_number_of_its_own_and_one_caller_has_one_stop(world: World) -> None:
-    latches = []
-    for name in ("ann", "joe", "joe"):
-        call(world, "stop", name)
-        latches.append(world.newest)
-        assert f"stopped by {public_name(name)} (native) at 2027-01-15 08:00" in world.state.reason
-        world.run(1.0)
-    assert latches == sorted(set(latches))
-    assert len(world.numbers) == 2
-    assert msgspec.json.decode(msgspec.json.encode(float(latches[-1]))) == latches[-1]
 
 
 def test_the_state_shows_each_cause(world: World) -> None:
@@ -158,22 +131,6 @@ def test_a_flood_of_stops_hides_neither_the_first_client_nor_the_last(world: Wor
     assert [cause.by for cause in world.state.causes] == [f"{JOE} (native)"]
 
 
-# an activate and a later deactivate
-
-
-@pytest.mark.parametrize("via", ["native", "rmw", "bridge"])
-def test_a_plain_activate_is_refused_for_two_seconds_after_a_deactivate(
-    world: World, via: Via
-) -> None:
-    call(world, "deactivate", "joe")
-    world.run(1.0)
-    reply = call(world, "activate", "ann", via=via)
-    assert (reply.success, world.state.mode) == (False, "inactive")
-    world.run(1.05)
-    assert call(world, "activate", "ann", via=via).success
-    assert world.state.mode == "ready"
-
-
 # a stop and a fault
 
 
@@ -192,28 +149,3 @@ def test_a_plain_clear_releases_the_fault_and_then_the_stop(world: World) -> Non
     assert world.state.mode == "stopped"
     assert call(world, "clear", "ann", via="rmw").success
     assert world.state.mode == "ready"
-
-
-# a restart
-
-
-def test_a_restarted_robot_stays_stopped_until_clear() -> None:
-    first = World()
-    first.run(0.2)
-    first.drive(0.5, seconds=1.0)
-    call(first, "stop", "joe")
-    assert first.outputs is not None
-    latches = after_restart(first.outputs.latches)
-    world = World(latches=latches)
-    world.run(0.2)
-    assert f"was stopped by {JOE} (native) at 2027-01-15 08:00:01 UTC, before the restart" in (
-        world.state.reason
-    )
-    (event,) = [event for event in world.events if event.name == "mode"]
-    assert (event.level, event.code) == ("warning", "stopped")
-    world.drive(0.5, seconds=3.0)
-    assert (moved(world, 0), world.state.mode) == (False, "stopped")
-    world.now_ns += 5 * NS_PER_S
-    assert call(world, "clear", "ann", world.numbers).success
-    world.drive(0.5, seconds=0.5)
-    assert world.state.mode == "driving"

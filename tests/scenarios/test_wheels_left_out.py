@@ -18,7 +18,7 @@ from acsard.core.config.settings import (
 from acsard.core.link.feedback import Feedback
 from acsard.core.messages.schema import DiagnosticArray, DiagnosticStatus
 from acsard.core.simulator.faults import Fault
-from acsard.core.values import NS_PER_S, WHEELS, Estimate, Event, Instant
+from acsard.core.values import WHEELS, Estimate, Event, Instant
 from tests.scenarios.imperfect_gyro import ImperfectGyro
 from tests.scenarios.world import World
 from tests.unit.odometer import Plain
@@ -101,33 +101,6 @@ def test_with_one_wheel_fault_the_pose_stays_right_and_state_names_the_wheel(
     assert any(f"{WHEELS[wheel]} wheel is left out" in report for report in reports)
 
 
-def test_a_dead_encoder_is_left_out_within_60_ms_and_the_robot_drives_on() -> None:
-    made = world()
-    made.drive(0.8, seconds=2.0)
-    begun, out = made.now_ns, 0
-    with made.mcu.stuck_encoder(1):
-        while made.now_ns - begun < NS_PER_S:
-            made.hold(0.8, seconds=0.01, hz=100.0)
-            if not out and made.state.wheel_fault.startswith("front_left wheel is left out"):
-                out = made.now_ns
-        assert made.state.mode == "driving"
-        assert "front_left wheel is blocked, or has no power" in made.state.wheel_fault
-    assert 0 < out - begun <= 0.06 * NS_PER_S
-    assert off(made)[1] < 0.05
-
-
-@pytest.mark.parametrize("speed", [0.05, 0.1, 0.3])
-def test_a_dead_encoder_is_left_out_and_named_at_any_speed_and_the_robot_drives_on(
-    speed: float,
-) -> None:
-    made = world()
-    made.drive(speed, seconds=1.0)
-    with made.mcu.stuck_encoder(0):
-        made.hold(speed, seconds=2.0)
-    assert made.state.mode == "driving"
-    assert made.state.wheel_fault.startswith("front_right wheel is left out of the pose")
-
-
 @pytest.mark.parametrize("up", [0.3, pytest.param(0.5, marks=SLOW)])
 def test_a_reversed_motor_on_a_bad_cable_is_found(up: float) -> None:
     """The link is lost again and again, before the evidence of one time is enough."""
@@ -140,18 +113,6 @@ def test_a_reversed_motor_on_a_bad_cable_is_found(up: float) -> None:
                 made.hold(0.3, seconds=0.15)
     assert made.state.mode == "fault"
     assert made.state.reason.startswith("front_right wheel does not obey its command")
-
-
-@SLOW
-def test_an_encoder_that_works_again_is_used_again() -> None:
-    made = world()
-    made.drive(0.5, seconds=1.0)
-    with made.mcu.stuck_encoder(2):
-        made.hold(0.5, seconds=1.0)
-        assert made.state.wheel_fault
-    made.hold(0.5, seconds=3.0)
-    assert not made.state.wheel_fault
-    assert off(made)[1] < 0.02
 
 
 @SLOW
@@ -281,61 +242,3 @@ def test_a_wheel_that_may_be_right_although_it_is_ignored_is_in_the_covariance(
         made.run(1.0)
     error, std = off(made)[1] - before, math.sqrt(made.odom.pose.covariance[35])
     assert 0.1 < error < 3.0 * std
-
-
-@pytest.mark.variations(6)
-@pytest.mark.parametrize("configured", [False, True])
-@pytest.mark.parametrize("counts", [16, 40, 100])
-@pytest.mark.parametrize(("linear", "angular"), [(0.5, 0.0), (0.15, 0.0), (0.0, 1.5)])
-def test_a_healthy_encoder_with_few_counts_does_not_look_like_one_that_fails(
-    linear: float, angular: float, counts: int, configured: bool
-) -> None:
-    """Such an encoder reports no motion in most lines."""
-    sim = SimConfig(encoder_counts=counts, motor_time_constant=0.1)
-    mcu = McuConfig(encoder_counts=counts if configured else 0)
-    made = World(Config(sim=sim, mcu=mcu))
-    made.run(1.5)
-    made.drive(linear, angular, seconds=4.0)
-    made.drive(linear, -angular, seconds=4.0)
-    pose = made.odom.pose.covariance
-    assert math.sqrt(pose[0]) < 0.1
-    assert math.sqrt(pose[35]) < 0.5
-
-
-def test_slip_makes_the_covariance_a_hundred_times_as_large() -> None:
-    made = world()
-    made.drive(0.5, seconds=1.5)
-    sure = made.odom.twist.covariance[0]
-    with made.mcu.bias(0, 1.15):
-        made.hold(0.5, seconds=0.3)
-        assert made.state.wheel_fault.startswith("right wheels slip")
-        assert made.odom.twist.covariance[0] == pytest.approx(100.0 * sure, rel=0.2)
-    made.hold(0.5, seconds=1.5)
-    assert made.odom.twist.covariance[0] == pytest.approx(sure, rel=0.2)
-
-
-@pytest.mark.parametrize("counts", [96, 3200])
-@pytest.mark.parametrize(
-    "seconds",
-    [
-        4,
-        pytest.param(120, marks=pytest.mark.slow),
-        pytest.param(3600, marks=[pytest.mark.soak, pytest.mark.timeout(3600)]),
-    ],
-)
-def test_ordinary_drives_cause_no_wheel_fault(counts: int, seconds: int) -> None:
-    """The robot skids on a slippery floor, has coarse encoders, and is sometimes pushed."""
-    sim = SimConfig(encoder_counts=counts, track_multiplier=1.6)
-    made, dice = world(sim=sim, counts=counts), random.Random(counts)
-    made.send(0.0)
-    made.run(0.1)
-    while made.now_ns < (6.5 + seconds) * NS_PER_S:
-        made.mcu.vehicle.turn_slip = dice.uniform(0.0, 0.5)
-        made.hold(dice.uniform(-0.6, 1.0), dice.uniform(-3.0, 3.0), dice.uniform(0.5, 3.0))
-        made.send(0.0)
-        made.run(dice.uniform(0.1, 2.0))
-        if dice.random() < 0.2:
-            made.run(1.0)
-            with made.mcu.pushed(dice.uniform(-0.5, 0.5)):
-                made.run(1.0)
-    assert not [event for event in made.events if event.name == "wheel_fault"]

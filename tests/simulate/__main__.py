@@ -13,12 +13,15 @@ import subprocess
 import sys
 import time
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
 from pathlib import Path
+from typing import Any
 
-from tests.simulate import pairs, shrink
-from tests.simulate.actors import Result, collect_seldom, played
+import msgspec
+
+from tests.simulate import shrink
+from tests.simulate.actors import Result, collect_seldom, digest, played
 from tests.simulate.plan import Plan, make_plan
 
 HERE = Path(__file__).parent
@@ -123,13 +126,18 @@ def keep_plans(broken: list[Result], where: Path) -> None:
         shrink.write_corpus_file(small, result, found_by, where / f"{result.seed}.json")
 
 
-def replay(what: str) -> int:
+def replay(what: str, log: Callable[[dict[str, Any]], None] | None = None) -> int:
     """Play the plan of a seed, or the plan in a JSON file."""
-    result = played(shrink.load(Path(what)) if what.endswith(".json") else make_plan(int(what)))
+    plan = shrink.load(Path(what)) if what.endswith(".json") else make_plan(int(what))
+    result = played(plan, log)
     if result.finding:
         show(result)
     print(f"{result.simulated_s:.1f} s simulated in {result.cpu_s:.1f} s")
     return int(bool(result.finding))
+
+
+def print_step(step: dict[str, Any]) -> None:
+    print(msgspec.json.encode(step).decode())
 
 
 def reduce(seed: int, keep: str) -> int:
@@ -163,23 +171,19 @@ def main() -> int:
     parser.add_argument("--shrink", metavar="SEED", type=int, help="find the smallest plan")
     parser.add_argument("--keep", metavar="NAME", default="", help="with --shrink: into corpus/")
     parser.add_argument("--plans", metavar="DIR", type=Path, help="keep the plan of each finding")
-    parser.add_argument("--against", metavar="TREE", help="compare with another checkout")
-    parser.add_argument(
-        "--adapter",
-        metavar="FILE",
-        type=Path,
-        help="with --against: its product.py, if it has none",
-    )
+    parser.add_argument("--steps", action="store_true", help="with --replay: print each step")
+    parser.add_argument("--digests", metavar="SEEDS", type=int, help="print one of each plan")
     options = parser.parse_args()
     if options.replay:
-        return replay(options.replay)
+        return replay(options.replay, print_step if options.steps else None)
     if options.shrink is not None:
         return reduce(options.shrink, options.keep)
-    if options.against:
-        tree = Path(options.against)
-        return pairs.compare(
-            tree, options.seed, options.hours * 3600, options.workers, options.adapter
-        )
+    if options.digests:
+        with ProcessPoolExecutor(options.workers, initializer=collect_seldom) as pool:
+            plans = (make_plan(options.seed + n) for n in range(options.digests))
+            for line in pool.map(digest, plans):
+                print(line, flush=True)
+        return 0
     within_s = options.within * 60
     return min(1, explore(options.seed, options.hours, options.workers, within_s, options.plans))
 

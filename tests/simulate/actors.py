@@ -97,6 +97,14 @@ def played(plan: Plan, log: Callable[[dict[str, Any]], None] | None = None) -> R
     return Result(plan["seed"], finding, promise, at_ns, simulated_s, cpu_s, run.counts)
 
 
+def digest(plan: Plan) -> str:
+    """Return a digest of all steps of a plan, which is the same in each product that acts alike."""
+    steps = hashlib.sha256()
+    # msgspec writes each float so that it can be read back to the last bit.
+    played(plan, lambda step: steps.update(msgspec.json.encode(step)))
+    return f"{plan['seed']} {steps.hexdigest()[:16]}"
+
+
 class Run:
     """One run of a plan: the daemon, its surroundings, and the judges that check the promises."""
 

@@ -37,25 +37,6 @@ def add(plan: Plan) -> None:
             return
 
 
-def removed(plan: Plan) -> Plan:
-    """Return the plan without the events and faults that an older simulator does not know."""
-    return plan | {
-        "board": [fault for fault in plan["board"] if fault[0] not in NEW],
-        "events": [
-            event
-            for event in plan["events"]
-            if event["do"] not in NEW and event.get("fault", [""])[0] not in NEW
-        ],
-    }
-
-
-NEW = {
-    "flip", "half_duplex", "constant_answers", "gyro", "runaway", "set_points", "gain",
-    "replies_twice",
-}  # fmt: skip
-"""Events and faults that an older simulator does not know."""
-
-
 def _best(plan: Plan) -> dict[str, Any]:
     """Return the source of the highest priority."""
     sources: list[dict[str, Any]] = plan["config"]["commands"]["sources"]

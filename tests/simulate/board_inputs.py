@@ -19,7 +19,7 @@ from typing import Any
 
 from tests.simulate.ages import MARGIN_NS
 from tests.simulate.product import StepResult
-from tests.simulate.promises import INPUTS, LINE, ZERO, BrokenError, Witness
+from tests.simulate.promises import LINE, ZERO, BrokenError, Witness
 from tests.simulate.roads import NS
 
 Plan = dict[str, Any]
@@ -229,16 +229,6 @@ def kinds(plan: Plan) -> set[str]:
     safety, names = plan["config"].get("safety", {}), {name for name, *_ in plan["board"]}
     inputs = names & {"estop", "battery", "driver_fault"}
     return inputs | ({safety.get("bumper", "stop")} if "bumpers" in safety else set())
-
-
-def removed(plan: Plan) -> Plan:
-    """Return the plan without inputs, for a product that does not know them."""
-    tables = plan["config"].items()
-    return plan | {
-        "config": {name: table for name, table in tables if name not in ("safety", "battery")},
-        "board": [fault for fault in plan["board"] if fault[0] not in INPUTS],
-        "events": [event for event in plan["events"] if event.get("fault", [""])[0] not in INPUTS],
-    }
 
 
 # judges

@@ -1,7 +1,6 @@
 """The interface of the simulator to the product. No other module here imports the product.
 
-A paired run loads this module twice, each time with another checkout of the product. Therefore
-everything that the simulator needs of the product is a method here, with plain data as arguments
+Everything that the simulator needs of the product is a method here, with plain data as arguments
 and results.
 
 Time is in ns of the robot's monotonic clock. `Product.see` is called after every control step.

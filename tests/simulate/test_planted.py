@@ -60,7 +60,7 @@ def test_each_promise_is_broken_by_a_planted_fault() -> None:
 
 def test_a_change_of_a_judge_changes_the_version() -> None:
     """Each module of the simulator is hashed, unless it cannot change the finding of a seed."""
-    beside = {"__init__", "__main__", "differences", "pairs", "shrink", "unjudged"}
+    beside = {"__init__", "__main__", "shrink"}
     planting = {"planted", "planted_faults"}
     modules = {path.stem for path in TABLE.parent.glob("*.py")}
     tests = {name for name in modules if name.startswith("test_")}
