@@ -75,7 +75,7 @@ MARKS = {"slow", "soak", "bench", "network", "systemd", "firmware", "languages",
 LOUD = (
     "test_board.py", "test_bus.py", "test_daemon.py", "test_link_faults.py", "test_bus_faults.py",
     "test_inputs.py", "test_access_isolation.py", "test_page_attacks.py", "test_page_lets_go.py",
-    "test_page_program_lets_go.py", "test_lateness_period.py", "test_recording_disks.py",
+    "test_lateness_period.py", "test_recording_disks.py",
     "test_access_strangers.py",
 )  # fmt: skip
 """Live modules that load the machine, or that count missed periods.

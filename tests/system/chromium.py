@@ -47,6 +47,9 @@ SETTLED_S = 1.1
 """Time for which a test shows the button that ends the page's mode before it presses the button.
 The page ignores a press in the first second."""
 
+RED = "getComputedStyle(document.getElementById('stop')).backgroundColor === 'rgb(196, 18, 10)'"
+"""Whether STOP has the red of the light style, which means that it works."""
+
 FINGER_PX = 44
 """Minimum width and height of an element that a finger presses."""
 
@@ -312,10 +315,20 @@ class Browser:
         except AssertionError as error:
             raise AssertionError(f"{error}; it said {texts}") from None
 
-    def key(self, kind: str, code: str, key: str) -> None:
-        """Send a keyboard event. `kind` is Down or Up."""
-        kind = "rawKeyDown" if kind == "Down" else "keyUp"
-        self.ask("Input.dispatchKeyEvent", type=kind, code=code, key=key)
+    def mouse(
+        self, kind: str, at: tuple[float, float], button: str = "left", *, buttons: int = 1,
+        clicks: int = 1,
+    ) -> None:  # fmt: skip
+        """Send a mouse event (Pressed, Moved or Released); `buttons` are those that are down."""
+        self.ask(
+            "Input.dispatchMouseEvent", type=f"mouse{kind}", x=at[0], y=at[1], button=button,
+            buttons=buttons, clickCount=clicks,
+        )  # fmt: skip
+
+    def key(self, kind: str, code: str, key: str, **more: Any) -> None:
+        """Send a keyboard event (Down or Up)."""
+        kind = "keyUp" if kind == "Up" else "keyDown" if "text" in more else "rawKeyDown"
+        self.ask("Input.dispatchKeyEvent", type=kind, code=code, key=key, **more)
 
     def picture(self, path: Path, *, whole: bool = False) -> None:
         """Write a PNG of the visible page, or of the `whole` page down to its end."""

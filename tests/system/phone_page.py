@@ -9,23 +9,15 @@ from typing import NamedTuple
 
 import pytest
 
+from tests.system import harness
 from tests.system.browser import Page
-from tests.system.chromium import (
-    Browser,
-)
+from tests.system.chromium import Browser
 from tests.system.harness import Bus, Daemon, until
 
 HELD = "document.getElementById('stick').matches('.held')"
 
-
-RED = "getComputedStyle(document.getElementById('stop')).backgroundColor === 'rgb(196, 18, 10)'"
-
-
 alone = pytest.mark.usefixtures("own_robot")
-"""Gives a test a new robot.
-
-The test ends or suspends a process, changes a setting, counts, or looks at a history.
-"""
+"""Gives a test a new robot, because the test changes a setting, counts, or looks at a history."""
 
 
 class Phone:
@@ -64,12 +56,5 @@ class Robot(NamedTuple):
 @contextmanager
 def running(where: Path) -> Iterator[Robot]:
     """Run a robot and its page."""
-    with Daemon(where) as daemon, Bus(daemon.endpoint) as bus:
-        bus.linked()
-        with Page(daemon, where) as server:
-            yield Robot(daemon, bus, server)
-
-
-def greyed(browser: Browser) -> bool:
-    """Return whether the stick is drawn as inactive."""
-    return bool(browser.js("document.getElementById('stick').ariaDisabled === 'true'"))
+    with harness.running(where) as (daemon, bus), Page(daemon, where) as server:
+        yield Robot(daemon, bus, server)

@@ -14,7 +14,7 @@ import math
 import ssl
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import suppress
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
@@ -108,27 +108,40 @@ def robot(hosts: Hosts, where: Path) -> Iterator[Daemon]:
 
 
 class Scene:
-    """The robot, its page, and a crowd on another host."""
+    """The robot's page, and a crowd on another host."""
 
-    def __init__(self, hosts: Hosts, page: Page, crowd: str, newer: str) -> None:
-        self._hosts, self.page = hosts, page
+    def __init__(self, hosts: Hosts, robot: Daemon, where: Path, crowd: str) -> None:
+        self._hosts, self._stack = hosts, ExitStack()
+        newer = f"https://[{ROBOT_6}]:{free_endpoint().rpartition(':')[2]}"
+        page = Page(robot, where, "--address", newer, at=ROBOT_AT)
+        self.page = self._stack.enter_context(on(hosts.robot, page))
         kind, count, sources = CROWDS[crowd]
-        where = newer if ":" in sources[0] else page.away
-        host, _, port = where.removeprefix("https://").rpartition(":")
-        words = command_line(CROWD, kind, host.strip("[]"), port, count, *sources)
-        self.crowd = Program(words, page.tls)
-        self._token = page.invite("operator", "phone")
-        self._trusted = ssl.create_default_context(cafile=str(page.tls / "ca.pem"))
+        at = newer if ":" in sources[0] else self.page.away
+        host, _, port = at.removeprefix("https://").rpartition(":")
+        self._words = command_line(CROWD, kind, host.strip("[]"), port, count, *sources)
+        self.token = self.page.invite("operator", f"phone-{time.time_ns()}")
+        self._trusted = ssl.create_default_context(cafile=str(self.page.tls / "ca.pem"))
 
-    async def comes(self) -> None:
+    def __enter__(self) -> Scene:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.goes()
+        assert error[0] is not None or self.page.process.poll() is None
+        assert "Traceback" not in self.page.stderr
+        self._stack.close()
+
+    def comes(self) -> None:
         """Start the crowd, and wait until it has opened all its connections."""
+        self.crowd = Program(self._words, self.page.tls)
         with inside(self._hosts.stranger):
             self.crowd.__enter__()
-        await asyncio.to_thread(self.crowd.says, "opened", PATIENCE_S)
+        self.crowd.says("opened", PATIENCE_S)
 
     def goes(self) -> None:
-        if hasattr(self.crowd, "process"):
+        if hasattr(self, "crowd"):
             self.crowd.__exit__()
+            del self.crowd
 
     def ask_here(self, path: str, payload: object = None) -> Any:
         """Send a request from the robot itself, and return the answer."""
@@ -136,52 +149,21 @@ class Scene:
             place = self.page.here.removeprefix("http://")
             return _asked(http.client.HTTPConnection(place, timeout=PATIENCE_S), path, payload)
 
-    def ask_away(self, path: str, payload: object = None) -> Any:
-        """Send a request by a new connection of the phone, and return the answer."""
+    def works_away(self) -> bool:
+        """Return whether a new connection of a phone stops the robot. Release the stop."""
         with inside(self._hosts.stranger):
             connection = http.client.HTTPSConnection(
-                self.page.away.removeprefix("https://"),
-                timeout=2.0,
-                context=self._trusted,
+                self.page.away.removeprefix("https://"), timeout=2.0, context=self._trusted,
                 source_address=(STRANGER_AT, 0),
-            )
-            return _asked(connection, path, payload, Authorization=f"Bearer {self._token}")
-
-    def clear(self) -> None:
-        """Release the stop from the robot itself."""
+            )  # fmt: skip
+            bearer = {"Authorization": f"Bearer {self.token}"}
+            try:
+                _asked(connection, "/api/srv/stop", {}, **bearer)
+            except (OSError, http.client.HTTPException, AssertionError):
+                return False
         causes = self.ask_here("/api/state")["causes"]
         numbers = [cause["number"] for cause in causes]
-        assert self.ask_here("/api/srv/clear", {"numbers": numbers})["success"]
-
-    def works_away(self) -> bool:
-        with suppress(OSError, http.client.HTTPException, AssertionError):
-            return bool(self.ask_away("/api/srv/stop", {})["success"])
-        return False
-
-    async def drive_through(self) -> list[str]:
-        """Drive from the phone while the crowd connects, and return the robot's modes meanwhile."""
-        with inside(self._hosts.stranger):
-            session = self.page.client(self._token)
-            opened = await session.ws_connect(f"{self.page.away}/ws", heartbeat=None)
-        async with session, opened:
-            ours = Hands(opened)
-            await ours.say(subscribe="state", rate=50)
-            await ours.state(lambda state: state["link"] == "up")
-            await ours.until_driving(0.3)
-            holding = asyncio.create_task(ours.hold(0.3, 3 * PATIENCE_S))
-            coming = asyncio.create_task(self.comes())
-            modes, end = list[str](), 0.0
-            # A state that was sent before the hold began does not count.
-            await ours.state(lambda state: state["mode"] == "driving")
-            while not end or time.monotonic() < end:
-                state = await ours.state(lambda state: state["mode"])
-                modes.append(state["mode"])
-                if coming.done() and not end:
-                    coming.result()
-                    end = time.monotonic() + 1.0
-            holding.cancel()
-            await ours.drive(0.0)
-        return modes
+        return bool(self.ask_here("/api/srv/clear", {"numbers": numbers})["success"])
 
 
 def _asked(
@@ -204,42 +186,23 @@ def _asked(
     [pytest.param(crowd, marks=pytest.mark.nightly if n else ()) for n, crowd in enumerate(CROWDS)],
 )
 def test_a_crowd_without_a_token_moves_no_robot_costs_no_period_and_leaves_a_page_that_works(
-    hosts: Hosts, robot: Daemon, where: Path, crowd: str, tmp_path: Path
+    hosts: Hosts, robot: Daemon, where: Path, crowd: str
 ) -> None:
-    (tmp_path / "tls").symlink_to(where / "tls")
-    newer = f"https://[{ROBOT_6}]:{free_endpoint().rpartition(':')[2]}"
-    server = Page(robot, tmp_path, "--address", newer, at=ROBOT_AT)
-    with inside(hosts.robot):
-        server.__enter__()
-    try:
-        scene = Scene(hosts, server, crowd, newer)
-        try:
-            _stand_through(scene, robot)
-        finally:
-            scene.goes()
-            scene.clear()
-        assert "Traceback" not in server.stderr
-        assert server.process.poll() is None
-    finally:
-        server.__exit__()
-
-
-def _stand_through(scene: Scene, robot: Daemon) -> None:
-    until(scene.works_away, BACK_S, "the page works before")
-    scene.clear()
-    kb = resident_kb(scene.page.pid)
-    before, waited = scene.ask_here("/api/state"), kept_waiting(robot.pid)
-    asyncio.run(asyncio.wait_for(scene.comes(), 2 * PATIENCE_S))
-    time.sleep(1.0)
-    after, waited = scene.ask_here("/api/state"), kept_waiting(robot.pid) - waited
-    more = resident_kb(scene.page.pid) - kb
+    with Scene(hosts, robot, where, crowd) as scene:
+        until(scene.works_away, BACK_S, "the page works before")
+        kb = resident_kb(scene.page.pid)
+        before, waited = scene.ask_here("/api/state"), kept_waiting(robot.pid)
+        scene.comes()
+        time.sleep(1.0)
+        after, waited = scene.ask_here("/api/state"), kept_waiting(robot.pid) - waited
+        more = resident_kb(scene.page.pid) - kb
+        took = min(_timed(lambda: scene.ask_here("/api/srv/stop", {})) for _ in range(5))
+        scene.goes()
+        begun = time.monotonic()
+        until(scene.works_away, BACK_S, "the page works for a new phone")
+        back = time.monotonic() - begun
     moved = math.hypot(after["x"] - before["x"], after["y"] - before["y"])
     missed = Periods.between(before, after).missed
-    took = min(_timed(lambda: scene.ask_here("/api/srv/stop", {})) for _ in range(5))
-    scene.goes()
-    begun = time.monotonic()
-    until(scene.works_away, BACK_S, "the page works for a new phone")
-    back = time.monotonic() - begun
     print(f"\n{more / 1000:+.1f} MB, moved {1000 * moved:.1f} mm, {missed} periods missed "
           f"({waited:.2f} s without a core), a stop from here {1000 * took:.0f} ms, back after "
           f"{back:.2f} s")  # fmt: skip
@@ -256,19 +219,30 @@ def _timed(call: Callable[[], object]) -> float:
     return max(0.0, took - 4 * lost(begun, begun + took))
 
 
-def test_a_phone_that_has_opened_the_page_drives_on_through_a_crowd(
-    hosts: Hosts, robot: Daemon, where: Path, tmp_path: Path
+async def test_a_phone_that_has_opened_the_page_drives_on_through_a_crowd(
+    hosts: Hosts, robot: Daemon, where: Path
 ) -> None:
-    (tmp_path / "tls").symlink_to(where / "tls")
-    server = Page(robot, tmp_path, at=ROBOT_AT)
-    with inside(hosts.robot):
-        server.__enter__()
-    scene = Scene(hosts, server, "2500 silent", "")
-    try:
-        modes = asyncio.run(asyncio.wait_for(scene.drive_through(), 4 * PATIENCE_S))
-        # On a busy machine the simulated board may be late, which "waiting" says.
-        assert modes.count("driving") + modes.count("waiting") == len(modes)
-        assert modes.count("driving") > 0.9 * len(modes)
-    finally:
-        scene.goes()
-        server.__exit__()
+    with Scene(hosts, robot, where, "2500 silent") as scene:
+        with inside(hosts.stranger):
+            session = scene.page.client(scene.token)
+            opened = await session.ws_connect(f"{scene.page.away}/ws", heartbeat=None)
+        async with session, opened, asyncio.timeout(4 * PATIENCE_S):
+            ours = Hands(opened)
+            await ours.say(subscribe="state", rate=50)
+            await ours.state(lambda state: state["link"] == "up")
+            await ours.until_driving(0.3)
+            holding = asyncio.create_task(ours.hold(0.3, 3 * PATIENCE_S))
+            # A state that was sent before the hold began does not count.
+            await ours.state(lambda state: state["mode"] == "driving")
+            coming = asyncio.create_task(asyncio.to_thread(scene.comes))
+            modes, end = list[str](), 0.0
+            while not end or time.monotonic() < end:
+                modes.append((await ours.state(lambda state: state["mode"]))["mode"])
+                if coming.done() and not end:
+                    coming.result()
+                    end = time.monotonic() + 1.0
+            holding.cancel()
+            await ours.drive(0.0)
+    # On a busy machine the simulated board may be late, which "waiting" says.
+    assert modes.count("driving") + modes.count("waiting") == len(modes)
+    assert modes.count("driving") > 0.9 * len(modes)

@@ -1,0 +1,266 @@
+"""The whole server of the page in this process, without a robot, for what no real client causes."""
+
+from __future__ import annotations
+
+import asyncio
+import socket
+from collections.abc import AsyncIterator, Callable
+from contextlib import asynccontextmanager, closing
+from pathlib import Path
+from typing import Any, cast
+from unittest.mock import Mock
+
+import aiohttp
+import pytest
+from aiohttp import web
+from msgspec.structs import replace
+from yarl import URL
+
+from acsard.bus.address import Address
+from acsard.core.config.settings import WebConfig
+from acsard.web.answers import unsent_bytes
+from acsard.web.app import Page
+from acsard.web.connections import Connections
+from acsard.web.followed_robot import About, FollowedRobot
+from acsard.web.metrics import Counts
+from acsard.web.socket_sender import MAX_UNREAD_BYTES
+from acsard.web.tokens import ReadTokens, Vault
+from acsard.web.viewer import Parts
+from tests.system.browser import Hands
+from tests.system.camera_stream import Stream
+from tests.system.harness import PATIENCE_S
+from tests.unit.screens import STATE, sample_of
+
+ABOUT = About("1", True, 1.0, 4.0, 10.0, "", {"teleop": 0.25, "app": 0.25})
+
+DEFAULT_CONFIG = WebConfig()
+
+DASHBOARD = "http://127.0.0.1:5173"
+
+
+class Whole:
+    """The server of the page, whose robot does not answer."""
+
+    def __init__(self, where: Path, rules: WebConfig = DEFAULT_CONFIG) -> None:
+        self.counts = Counts()
+        self.robot = FollowedRobot(
+            Address("tcp/127.0.0.1:1", "acsar", ""), Mock(), ABOUT, self.counts
+        )
+        self.parts, self.connections = Parts(self.robot, self.counts), Connections(self.counts)
+        tokens = ReadTokens(Vault(where, "acsar"))
+        self.page = Page(self.parts, tokens, frozenset(), self.connections, rules)
+
+    @asynccontextmanager
+    async def served(self) -> AsyncIterator[tuple[URL, aiohttp.ClientSession]]:
+        """Serve the page on loopback, and yield its URL and a client."""
+        runner = web.AppRunner(self.page.app, handle_signals=False, shutdown_timeout=0.1)
+        await runner.setup()
+        assert runner.server is not None
+        with socket.create_server(("127.0.0.1", 0)) as listening:
+            listening.setblocking(False)
+            accepting = asyncio.create_task(self.connections.accept(runner.server, listening, None))
+            async with aiohttp.ClientSession() as session:
+                yield URL(f"http://127.0.0.1:{listening.getsockname()[1]}"), session
+            accepting.cancel()
+        await runner.cleanup()
+
+    @asynccontextmanager
+    async def hands(self) -> AsyncIterator[Hands]:
+        """Serve the page and open its WebSocket as a client."""
+        async with self.served() as (url, session), session.ws_connect(url / "ws") as opened:
+            yield Hands(opened)
+
+
+@pytest.fixture
+def whole(tmp_path: Path) -> Whole:
+    return Whole(tmp_path)
+
+
+async def eventually(look: Callable[[], Any]) -> None:
+    async with asyncio.timeout(PATIENCE_S):
+        while not look():
+            await asyncio.sleep(0.01)
+
+
+async def test_a_client_that_must_disconnect_drives_no_more_even_if_it_does_not_read(
+    whole: Whole,
+) -> None:
+    async with whole.hands() as ours:
+        await ours.find(lambda frame: "hello" in frame)
+        await ours.drive(0.0)
+        await eventually(lambda: whole.counts.all().get("commands_dropped"))
+        (viewer,) = whole.page._viewers
+        wire = cast(Any, ours.socket)._response.connection.transport
+        wire.pause_reading()
+        viewer._out.enqueue({"more than a kernel holds": "x" * 20_000_000})
+        whole.page.end_all("your token has expired")
+        before = whole.counts.all()
+        for _ in range(20):
+            await ours.drive(0.5)
+            await asyncio.sleep(0.01)
+        await ours.say(ping=1)
+        await asyncio.sleep(0.2)
+        whole.parts.outbox.flush(PATIENCE_S)
+        assert whole.counts.all() == before
+        wire.abort()
+
+
+async def test_a_client_that_stops_reading_later_gets_only_the_newest_message(
+    whole: Whole,
+) -> None:
+    def publish(x: int) -> None:
+        whole.robot.streams._streams["state"].take(sample_of(replace(STATE, x=float(x))))
+
+    async with whole.hands() as ours:
+        await ours.say(subscribe="state", rate=50)
+        await eventually(lambda: whole.robot.streams._streams)
+        publish(0)
+        await ours.state(lambda state: state["x"] == 0.0)
+        wire = cast(Any, ours.socket)._response.connection.transport
+        wire.pause_reading()
+        (viewer,) = whole.page._viewers
+        number = 0
+        while whole.counts.all().get("frames_left_out", 0) < 10:
+            # More than the kernels hold, which enlarge their buffers meanwhile:
+            while unsent_bytes(viewer._out._transport) <= MAX_UNREAD_BYTES:
+                if not viewer._out._out:  # more would let the server wait for the client
+                    viewer._out.enqueue("x" * 16384)
+                await asyncio.sleep(0)
+            publish(number := number + 1)
+            await asyncio.sleep(0.02)
+        wire.resume_reading()
+        await ours.find(lambda frame: "value" in frame and frame["value"]["x"] == number)
+        assert sum("value" in frame for frame in ours.heard) < number - 5
+
+
+async def test_a_client_that_unsubscribes_and_disconnects_leaves_no_subscription(
+    whole: Whole,
+) -> None:
+    streams = whole.robot.streams
+    async with whole.hands() as ours:
+        await ours.say(subscribe="odom", rate=50)
+        await eventually(lambda: "odom" in streams._streams)
+        streams.update(Mock())
+        # The server reads both messages at once.
+        await ours.say(unsubscribe="odom")
+        await ours.socket.close()
+        await eventually(lambda: not whole.page._viewers)
+        streams.update(Mock())
+        assert "odom" not in streams._streams
+
+
+async def test_a_client_on_the_robot_has_the_role_of_the_configuration(tmp_path: Path) -> None:
+    whole = Whole(tmp_path, WebConfig(local="operator"))
+    async with whole.hands() as ours:
+        hello = (await ours.find(lambda frame: "hello" in frame))["hello"]
+        assert hello["role"] == "operator"
+        assert "set" in hello["barred"]
+        assert not (await ours.call("set", settings={}))["ok"]
+    assert whole.counts.refused() == {"role": 1}
+
+
+async def test_a_command_of_an_unknown_source_is_refused(whole: Whole) -> None:
+    async with whole.hands() as program:
+        program.source = "nobody"
+        await program.drive(0.1)
+        refused = await program.find(lambda message: message.get("refused") == "cmd")
+        assert "nobody is not one of the robot's sources: teleop, app" in refused["reason"]
+
+
+async def test_only_a_page_of_a_listed_origin_may_send_requests_and_read_answers(
+    tmp_path: Path,
+) -> None:
+    """The test also tries another page of this machine, and the robot's own page."""
+    whole = Whole(tmp_path, WebConfig(origins=(DASHBOARD,)))
+    async with whole.served() as (url, session):
+        stop, own = url / "api/srv/stop", str(url.origin())
+        for origin, status, readable in [
+            (DASHBOARD, 409, DASHBOARD),  # there is no robot to stop
+            ("http://127.0.0.1:5174", 403, None),
+            ("null", 403, None),
+            (own, 409, None),
+        ]:
+            site = "same-origin" if origin == own else "same-site"
+            headers = {"Origin": origin, "Sec-Fetch-Site": site}
+            async with session.post(stop, headers=headers) as answer:
+                assert answer.status == status, origin
+                assert answer.headers.get("Access-Control-Allow-Origin") == readable
+                assert "Access-Control-Allow-Credentials" not in answer.headers
+                assert answer.headers["Vary"] == "Origin"
+        # A browser asks before it sends a token.
+        asked = {"Access-Control-Request-Method": "POST"}
+        async with session.options(stop, headers=asked | {"Origin": DASHBOARD}) as answer:
+            assert answer.status == 204
+            assert answer.headers["Access-Control-Allow-Origin"] == DASHBOARD
+            assert "Authorization" in answer.headers["Access-Control-Allow-Headers"]
+        for more in ({"Origin": "http://evil.example"}, {"Origin": DASHBOARD, "Host": "evil"}, {}):
+            async with session.options(stop, headers=asked | more) as answer:
+                assert answer.status in (403, 405)
+        async with session.ws_connect(url / "ws", headers={"Origin": DASHBOARD}) as opened:
+            assert "hello" in (await opened.receive()).data
+        with pytest.raises(aiohttp.WSServerHandshakeError, match="403"):
+            await session.ws_connect(url / "ws", headers={"Origin": "http://127.0.0.1:5174"})
+        at, from_there = url / "token", {"Origin": DASHBOARD}
+        async with session.post(at, json={"token": "x"}, headers=from_there) as answer:
+            assert answer.status == 403
+            assert "another site" in (await answer.json())["error"]
+
+
+async def test_each_picture_of_the_camera_is_sent_once(tmp_path: Path) -> None:
+    with closing(Stream()) as stream:
+        whole = Whole(tmp_path, WebConfig(camera=f"http://127.0.0.1:{stream.port}/stream"))
+        async with whole.served() as (url, session):
+
+            async def picture(tag: str = "") -> aiohttp.ClientResponse:
+                headers = {"If-None-Match": tag} if tag else {}
+                async with session.get(url / "api/camera", headers=headers) as answer:
+                    await answer.read()
+                    return answer
+
+            first = await picture()
+            assert (first.status, first.content_type) == (200, "image/jpeg")
+            assert int(first.headers["Age-Ms"]) < 1000 * PATIENCE_S
+            second = await picture(first.headers["ETag"])
+            assert second.headers["ETag"] != first.headers["ETag"]
+            stream.silent = True
+            await asyncio.sleep(0.3)
+            last = await picture()
+            assert (await picture(last.headers["ETag"])).status == 304
+        whole.page.end_all("")
+
+
+@pytest.mark.parametrize(
+    ("camera", "status", "error", "detail"),
+    [
+        ("", 404, "no camera is configured", "set web.camera to the address of its stream"),
+        ("http://127.0.0.1:1/x", 503, "the camera's stream cannot be read", "127.0.0.1:1"),
+    ],
+)
+async def test_a_camera_that_cannot_be_shown_is_explained(
+    tmp_path: Path, camera: str, status: int, error: str, detail: str
+) -> None:
+    whole = Whole(tmp_path, WebConfig(camera=camera))
+    async with whole.served() as (url, session), session.get(url / "api/camera") as answer:
+        problem = await answer.json()
+        assert (answer.status, problem["error"]) == (status, error)
+        assert detail in problem["detail"]
+    whole.page.end_all("")
+
+
+async def test_no_other_page_can_frame_the_page_or_add_scripts_to_it(whole: Whole) -> None:
+    async with whole.served() as (url, session):
+        for path in ("", "page/main.js", "api/whoami", "nothing"):
+            async with session.get(url / path) as answer:
+                policy = answer.headers["Content-Security-Policy"].split("; ")
+                assert {"default-src 'self'", "frame-ancestors 'none'"} <= set(policy)
+                assert answer.headers["X-Frame-Options"] == "DENY"
+                assert answer.headers["X-Content-Type-Options"] == "nosniff"
+
+
+async def test_a_path_called_with_another_method_names_the_method_it_accepts(whole: Whole) -> None:
+    async with whole.served() as (url, session):
+        async with session.get(url / "api/srv/stop") as answer:
+            assert (answer.status, answer.headers["Allow"]) == (405, "POST")
+            assert (await answer.json())["error"] == "this path accepts only POST"
+        async with session.post(url / "api/nothing") as answer:
+            assert answer.status == 404
