@@ -7,12 +7,20 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import zenoh
 
 from acsard.machine.authority import Authority
-from tests.system.harness import acsard, client_config, finish, free_endpoint
+from tests.system.harness import (
+    Daemon,
+    Finished,
+    Tables,
+    acsard,
+    client_config,
+    finish,
+    free_endpoint,
+)
 
 Identity = Literal[
     "local", "viewer", "operator", "maintainer", "unlisted", "nobody", "foreign", "expired"
@@ -82,3 +90,35 @@ class Certificates:
 def free_tls_endpoint() -> str:
     """Return a loopback address for TLS on which no program listens."""
     return free_endpoint().replace("tcp/", "tls/")
+
+
+class Gated:
+    """A daemon with a plain and a TLS endpoint, and clients that come to either."""
+
+    def __init__(self, where: Path, certificates: Certificates | None = None, **more: Any) -> None:
+        self.certificates = certificates or Certificates(where)
+        self.plain, self.tls = free_endpoint(), free_tls_endpoint()
+        bus = {"listen": [self.plain, self.tls], "tls": str(self.certificates.robot)}
+        tables: Tables = {"bus": bus} | more
+        self.daemon = Daemon(where, config=tables, endpoint=self.plain)
+
+    def own(self, identity: Identity) -> str:
+        return str(self.certificates.own(identity))
+
+    def opened(self, identity: Identity) -> zenoh.Session:
+        """Open a session with this identity."""
+        return zenoh.open(self.certificates.config(identity, self.plain, self.tls))
+
+    def lets_in(self, identity: Identity) -> bool:
+        """Return whether a new session with this identity gets an answer."""
+        try:
+            with self.opened(identity) as session:
+                return any(r.ok for r in session.get("acsard/acsar/state", timeout=1.0))
+        except zenoh.ZError:
+            return False
+
+    def tool(self, who: Identity, *words: str) -> Finished:
+        link = ("--connect", self.tls, "--tls", self.own(who))
+        ended = finish(acsard(*words, *link), self.daemon.config.parent)
+        assert "Traceback" not in ended.err, ended.err
+        return ended

@@ -34,8 +34,8 @@ from tests.permissions import (
 )
 from tests.system import ros_clients as ros
 from tests.system.fleet_router import ROBOTS, Fleet
-from tests.system.harness import ZERO, Bus, Daemon, Tables, free_endpoint, until
-from tests.system.identities import ADMITTED, Certificates, Identity, free_tls_endpoint
+from tests.system.harness import ZERO, Bus, until
+from tests.system.identities import ADMITTED, Gated, Identity
 
 pytestmark = pytest.mark.network
 
@@ -167,17 +167,15 @@ class AtRobot(Place):
     table = with_deletes(row for rows in (native("acsard/acsar"), by_ros()) for row in rows)
 
     def open(self) -> None:
-        self.certificates = Certificates(self.where)
-        self.plain, self.tls = free_endpoint(), free_tls_endpoint()
-        bus = {"listen": [self.plain, self.tls], "tls": str(self.certificates.robot)}
-        config: Tables = {"bus": bus, "sim": {"faults": ["battery=80:600"]}}  # so it has messages
-        daemon = Daemon(self.where, config=config, endpoint=self.plain)
-        self.stack.enter_context(daemon)
-        self.robots = [self.stack.enter_context(Bus(self.plain))]
+        # Its board reports the battery, so that each key has messages.
+        self.gated = Gated(self.where, sim={"faults": ["battery=80:600"]})
+        self.stack.enter_context(self.gated.daemon)
+        self.robots = [self.stack.enter_context(Bus(self.gated.plain))]
         self.robots[0].linked()
 
     def config(self, identity: str) -> zenoh.Config:
-        return self.certificates.config(identity, self.plain, self.tls)  # type: ignore[arg-type]
+        plain, tls = self.gated.plain, self.gated.tls
+        return self.gated.certificates.config(identity, plain, tls)  # type: ignore[arg-type]
 
 
 class AtRouter(Place):
@@ -375,9 +373,10 @@ def judge(place: Place, identity: str, verb: Verb) -> None:
 
 
 def test_a_link_ends_with_its_certificate(robot: AtRobot, tmp_path: Path) -> None:
-    robot.certificates.issue(tmp_path, "operator", 2.0 / 86400.0)
+    certificates = robot.gated.certificates
+    certificates.issue(tmp_path, "operator", 2.0 / 86400.0)
     end = time.monotonic() + 2.0
-    with zenoh.open(robot.certificates.client_settings(robot.tls, tmp_path)) as session:
+    with zenoh.open(certificates.client_settings(robot.gated.tls, tmp_path)) as session:
         assert list(session.get("acsard/acsar/info", timeout=1.0))
         until(lambda: not list(session.info.routers_zid()), 6.0, "the link ends")
         assert time.monotonic() > end - 1.1  # certificates count whole seconds

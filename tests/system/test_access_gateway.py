@@ -12,7 +12,6 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-import zenoh
 from msgspec.structs import replace
 
 from acsard.bus.certificate_watch import FILES_CHECK_PERIOD_NS
@@ -32,35 +31,15 @@ from tests.system.harness import (
     until,
     write_config,
 )
-from tests.system.identities import Certificates, free_tls_endpoint
+from tests.system.identities import Certificates, Gated, free_tls_endpoint
 
 pytestmark = pytest.mark.network
 
 
-class Open:
-    """A daemon with a TLS gateway, and clients that connect to the gateway."""
-
-    def __init__(self, where: Path, certificates: Certificates) -> None:
-        self._certificates = certificates
-        self._plain, self.tls = free_endpoint(), free_tls_endpoint()
-        bus = {"listen": [self._plain, self.tls], "tls": str(certificates.robot)}
-        self.daemon = Daemon(where, config={"bus": bus}, endpoint=self._plain)
-
-    def gateway(self) -> int:
-        """Return the pid of the gateway's process."""
-        (pid,) = until(lambda: children(self.daemon.pid, "acsard gateway"), 5.0, "a gateway")
-        return pid
-
-    def connect(self) -> zenoh.Session:
-        """Open a session of a viewer to the gateway."""
-        return zenoh.open(self._certificates.config("viewer", self._plain, self.tls))
-
-    def lets_in(self) -> bool:
-        try:
-            with self.connect() as session:
-                return any(r.ok for r in session.get("acsard/acsar/state", timeout=1.0))
-        except zenoh.ZError:
-            return False
+def gateway_of(robot: Gated) -> int:
+    """Return the pid of the gateway's process."""
+    (pid,) = until(lambda: children(robot.daemon.pid, "acsard gateway"), 5.0, "a gateway")
+    return pid
 
 
 @pytest.fixture(scope="module")
@@ -69,8 +48,8 @@ def certificates(tmp_path_factory: pytest.TempPathFactory) -> Certificates:
 
 
 @pytest.fixture
-def robot(tmp_path: Path, certificates: Certificates) -> Iterator[Open]:
-    robot = Open(tmp_path, certificates)
+def robot(tmp_path: Path, certificates: Certificates) -> Iterator[Gated]:
+    robot = Gated(tmp_path, certificates)
     with robot.daemon:
         yield robot
 
@@ -83,9 +62,9 @@ def has_ended(pid: int) -> bool:
         return True
 
 
-def test_a_gateway_that_is_killed_is_restarted_and_counted(robot: Open) -> None:
-    assert robot.lets_in()
-    first = robot.gateway()
+def test_a_gateway_that_is_killed_is_restarted_and_counted(robot: Gated) -> None:
+    assert robot.lets_in("viewer")
+    first = gateway_of(robot)
     with Bus(robot.daemon.endpoint) as bus:
         until(
             lambda: bus.count("gateway_opened") == 1,
@@ -94,8 +73,8 @@ def test_a_gateway_that_is_killed_is_restarted_and_counted(robot: Open) -> None:
         )
     os.kill(first, signal.SIGKILL)
     robot.daemon.gateway_opens(times=2)
-    assert robot.lets_in()
-    assert robot.gateway() != first
+    assert robot.lets_in("viewer")
+    assert gateway_of(robot) != first
     (line,) = robot.daemon.events("gateway_ended")
     assert "ended by signal 9" in line["text"]
     with Bus(robot.daemon.endpoint) as bus:
@@ -105,9 +84,9 @@ def test_a_gateway_that_is_killed_is_restarted_and_counted(robot: Open) -> None:
 @pytest.mark.nightly
 def test_a_new_certificate_is_used_and_the_daemon_runs_on(tmp_path: Path) -> None:
     certificates = Certificates(tmp_path / "own")
-    robot, own = Open(tmp_path, certificates), certificates.robot
+    robot, own = Gated(tmp_path, certificates), certificates.robot
     with robot.daemon:
-        assert robot.lets_in()
+        assert robot.lets_in("viewer")
         before_ns = peer_ends_ns(robot.tls, str(own))
         key = (own / KEY).read_bytes()
         Authority.load(own, str).issue(own, "robot", ["127.0.0.1"], 0.5)
@@ -118,7 +97,7 @@ def test_a_new_certificate_is_used_and_the_daemon_runs_on(tmp_path: Path) -> Non
         (own / KEY).write_bytes(new)
         robot.daemon.gateway_opens(times=3)  # the second line says that it opens again
         assert "restarts with its new certificate" in robot.daemon.events("gateway_open")[1]["text"]
-        assert robot.lets_in()
+        assert robot.lets_in("viewer")
         after_ns = peer_ends_ns(robot.tls, str(own))
         assert before_ns is not None
         assert after_ns is not None
@@ -131,16 +110,16 @@ def test_a_new_certificate_is_used_and_the_daemon_runs_on(tmp_path: Path) -> Non
 
 
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM])
-def test_the_gateway_closes_with_the_daemon(robot: Open, number: signal.Signals) -> None:
-    gateway = robot.gateway()
+def test_the_gateway_closes_with_the_daemon(robot: Gated, number: signal.Signals) -> None:
+    gateway = gateway_of(robot)
     robot.daemon.signal(number)
     robot.daemon.ended(5.0)
     until(lambda: has_ended(gateway), 1.0, "it closes")
-    assert not robot.lets_in()
+    assert not robot.lets_in("viewer")
 
 
-def test_no_gateway_that_hangs_outlives_its_daemon(robot: Open) -> None:
-    gateway = robot.gateway()
+def test_no_gateway_that_hangs_outlives_its_daemon(robot: Gated) -> None:
+    gateway = gateway_of(robot)
     os.kill(gateway, signal.SIGSTOP)
     robot.daemon.signal(signal.SIGTERM)
     begun = time.monotonic()
@@ -151,11 +130,11 @@ def test_no_gateway_that_hangs_outlives_its_daemon(robot: Open) -> None:
 
 
 @pytest.mark.nightly
-def test_a_gateway_that_is_suspended_is_ended_and_restarted(robot: Open) -> None:
-    first = robot.gateway()
+def test_a_gateway_that_is_suspended_is_ended_and_restarted(robot: Gated) -> None:
+    first = gateway_of(robot)
     os.kill(first, signal.SIGSTOP)
     robot.daemon.gateway_opens(times=2)
-    assert robot.lets_in()
+    assert robot.lets_in("viewer")
     assert has_ended(first)
     (line,) = robot.daemon.events("gateway_ended")
     assert "stopped or hung" in line["text"]
@@ -163,13 +142,13 @@ def test_a_gateway_that_is_suspended_is_ended_and_restarted(robot: Open) -> None
 
 @pytest.mark.parametrize("paused", ["daemon", "gateway"])
 def test_a_stop_over_tls_that_waits_for_longer_than_two_seconds_stops_the_robot(
-    robot: Open, paused: str
+    robot: Gated, paused: str
 ) -> None:
-    until(robot.lets_in, 5.0, "it is open")
-    with robot.connect() as viewer, Bus(robot.daemon.endpoint) as bus:
+    until(lambda: robot.lets_in("viewer"), 5.0, "it is open")
+    with robot.opened("viewer") as viewer, Bus(robot.daemon.endpoint) as bus:
         assert any(reply.ok for reply in viewer.get("acsard/acsar/state", timeout=3.0))
         assert bus.state()["mode"] != "stopped"
-        pid = robot.daemon.pid if paused == "daemon" else robot.gateway()
+        pid = robot.daemon.pid if paused == "daemon" else gateway_of(robot)
         os.kill(pid, signal.SIGSTOP)
         try:
             viewer.put("acsard/acsar/stop", b"")
@@ -180,7 +159,7 @@ def test_a_stop_over_tls_that_waits_for_longer_than_two_seconds_stops_the_robot(
         with Bus(robot.daemon.endpoint) as other:
             until(lambda: other.state()["mode"] == "stopped", 5.0, "the stop arrives")
         if paused == "gateway":
-            assert robot.gateway() == pid
+            assert gateway_of(robot) == pid
 
 
 def test_without_a_tls_endpoint_there_is_no_gateway_to_open(tmp_path: Path) -> None:

@@ -17,8 +17,8 @@ import zenoh
 from acsard.client import Client, connect
 from acsard.core.values import NS_PER_S
 from tests.system.browser import Page, hands, run
-from tests.system.harness import Bus, Daemon, free_endpoint, twist, until
-from tests.system.identities import Certificates, free_tls_endpoint
+from tests.system.harness import Bus, twist, until
+from tests.system.identities import Gated
 
 pytestmark = pytest.mark.network
 
@@ -26,35 +26,12 @@ AHEAD_NS = NS_PER_S // 50
 ATTACK_S = 1.5
 
 
-class Robot:
-    """A daemon at a plain and a TLS endpoint."""
-
-    def __init__(self, where: Path) -> None:
-        self.certificates = Certificates(where)
-        self.plain, self.tls = free_endpoint(), free_tls_endpoint()
-        bus: dict[str, object] = {
-            "listen": [self.plain, self.tls],
-            "tls": str(self.certificates.robot),
-        }
-        tables: dict[str, dict[str, object]] = {"bus": bus}
-        self.daemon = Daemon(where, config=tables, endpoint=self.plain)
-
-    @contextmanager
-    def operator(self) -> Iterator[zenoh.Session]:
-        """A plain Zenoh session that shows the operator's certificate."""
-        config = self.certificates.client_settings(self.tls, self.certificates.own("operator"))
-        with zenoh.open(config) as session:
-            until(
-                lambda: list(session.get("acsard/acsar/info", timeout=1.0)), 10.0, "the TLS gateway"
-            )
-            yield session
-
-
 @pytest.fixture(scope="module")
-def robot(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Robot]:
-    robot = Robot(tmp_path_factory.mktemp("identity"))
+def robot(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Gated]:
+    robot = Gated(tmp_path_factory.mktemp("identity"))
     with robot.daemon, Bus(robot.plain) as bus:
         bus.linked()
+        until(lambda: robot.lets_in("operator"), 10.0, "the TLS gateway")
         yield robot
 
 
@@ -91,7 +68,7 @@ def attack(session: zenoh.Session, keys: tuple[str, ...], sender: str) -> None:
         time.sleep(0.02)
 
 
-def attacked(robot: Robot, victim: Client, sender: str = "") -> list[Any]:
+def attacked(robot: Gated, victim: Client, sender: str = "") -> list[Any]:
     """Let an operator attack the victim while it drives. Return the states during the attack.
 
     The attack uses this sender id, or the id that `state` publishes if it is empty.
@@ -99,7 +76,7 @@ def attacked(robot: Robot, victim: Client, sender: str = "") -> list[Any]:
     keys = tuple(f"acsard/acsar/cmd/teleop{end}" for end in ("", "/operator", "/maintainer"))
     with (
         Bus(robot.plain) as bus,
-        robot.operator() as session,
+        robot.opened("operator") as session,
         bus.follow("state") as states,
         driving(victim, ATTACK_S + 3.0),
     ):
@@ -109,7 +86,7 @@ def attacked(robot: Robot, victim: Client, sender: str = "") -> list[Any]:
         return [entry.value for entry in states.seen[begun:]]
 
 
-def test_the_published_sender_does_not_take_the_robot_from_another_program(robot: Robot) -> None:
+def test_the_published_sender_does_not_take_the_robot_from_another_program(robot: Gated) -> None:
     with connect(robot.plain, source="teleop") as victim:
         states = attacked(robot, victim)
     assert len(states) > 10
@@ -120,7 +97,7 @@ def test_the_published_sender_does_not_take_the_robot_from_another_program(robot
     }
 
 
-def test_a_stolen_secret_does_not_take_the_robot_under_another_certificate(robot: Robot) -> None:
+def test_a_stolen_secret_does_not_take_the_robot_under_another_certificate(robot: Gated) -> None:
     with connect(robot.plain, source="teleop") as victim, Bus(robot.plain) as bus:
         refused = bus.count("command_other_certificate")
         states = attacked(robot, victim, victim._connection._sender._id)
@@ -136,8 +113,8 @@ def test_a_stolen_secret_does_not_take_the_robot_under_another_certificate(robot
     assert any(event["by"] == f"{victim._connection.sender} [operator]" for event in events)
 
 
-def test_the_sender_of_a_client_over_tls_has_the_name_of_its_certificate(robot: Robot) -> None:
-    tls = str(robot.certificates.own("operator"))
+def test_the_sender_of_a_client_over_tls_has_the_name_of_its_certificate(robot: Gated) -> None:
+    tls = robot.own("operator")
     with connect(robot.tls, tls=tls) as client, Bus(robot.plain) as bus:
         bus.at_rest()  # the other tests' drives are over
         with bus.follow("state") as states:
@@ -149,7 +126,7 @@ def test_the_sender_of_a_client_over_tls_has_the_name_of_its_certificate(robot: 
 
 
 def test_a_page_server_connected_over_tls_drives_under_its_certificate_s_name(
-    robot: Robot, tmp_path: Path
+    robot: Gated, tmp_path: Path
 ) -> None:
     async def story() -> None:
         async with hands(page) as ours:
@@ -161,7 +138,7 @@ def test_a_page_server_connected_over_tls_drives_under_its_certificate_s_name(
             state = await ours.state(lambda state: (state["linear"] or 0.0) > 0.1)
             assert state["sender"] == hello["hello"]["sender"]
 
-    by_tls = ["--connect", robot.tls, "--tls", str(robot.certificates.own("operator"))]
+    by_tls = ["--connect", robot.tls, "--tls", robot.own("operator")]
     with Page(robot.daemon, tmp_path, *by_tls) as page, Bus(robot.plain) as bus:
         run(story)
         bus.at_rest()

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator
-from pathlib import Path
 
 import pytest
 
@@ -12,15 +11,12 @@ from acsard.client import connect
 from acsard.core.values import ROLES
 from tests.system.harness import (
     Bus,
-    Daemon,
-    Finished,
     Program,
     acsard,
-    finish,
     free_endpoint,
     until,
 )
-from tests.system.identities import Certificates, Identity, free_tls_endpoint
+from tests.system.identities import Gated, Identity
 from tests.system.terminals import SCREEN, at_terminal
 from tests.system.viewer import Viewer
 
@@ -33,28 +29,9 @@ SILENCE = "your certificate, unlisted, may be missing from every role"
 """The last part of the message for a silence that may have any cause."""
 
 
-class Robot:
-    """A daemon with a TLS gateway, and the certificates of its roles."""
-
-    def __init__(self, where: Path) -> None:
-        self.certificates, self.tls = Certificates(where), free_tls_endpoint()
-        self.plain = free_endpoint()
-        bus = {"listen": [self.plain, self.tls], "tls": str(self.certificates.robot)}
-        self.daemon = Daemon(where, config={"bus": bus}, endpoint=self.plain)
-
-    def own(self, identity: Identity) -> str:
-        return str(self.certificates.own(identity))
-
-    def tool(self, who: Identity, *words: str) -> Finished:
-        link = ("--connect", self.tls, "--tls", self.own(who))
-        ended = finish(acsard(*words, *link), self.daemon.config.parent)
-        assert "Traceback" not in ended.err, ended.err
-        return ended
-
-
 @pytest.fixture(scope="module")
-def robot(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Robot]:
-    robot = Robot(tmp_path_factory.mktemp("whoami"))
+def robot(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Gated]:
+    robot = Gated(tmp_path_factory.mktemp("whoami"))
     with robot.daemon, Bus(robot.plain) as bus:
         bus.linked()
         until(lambda: robot.tool("viewer", "get", "info").code == 0, 10.0, "the gateway")
@@ -62,32 +39,32 @@ def robot(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Robot]:
 
 
 @pytest.mark.parametrize("role", ROLES)
-def test_whoami_returns_the_role_and_name_of_each_certificate(robot: Robot, role: Identity) -> None:
+def test_whoami_returns_the_role_and_name_of_each_certificate(robot: Gated, role: Identity) -> None:
     with connect(robot.tls, tls=robot.own(role)) as client:
         us = client.whoami()
         assert (us.role, us.certificate, us.sender) == (role, role, client._connection.sender)
 
 
-def test_a_local_client_without_a_certificate_is_a_maintainer(robot: Robot) -> None:
+def test_a_local_client_without_a_certificate_is_a_maintainer(robot: Gated) -> None:
     with connect(robot.plain) as client:
         us = client.whoami()
     assert (us.role, us.certificate) == ("maintainer", "")
 
 
-def test_doctor_prints_the_role_the_certificate_and_its_permissions(robot: Robot) -> None:
+def test_doctor_prints_the_role_the_certificate_and_its_permissions(robot: Gated) -> None:
     output = robot.tool("viewer", "doctor").out
     assert f"role: your certificate viewer has the role viewer: {VIEWER_MAY}" in output
     assert re.search(r"; your sender id is \S+/\d+/", output)
 
 
 @pytest.mark.slow
-def test_doctor_reports_an_unlisted_certificate(robot: Robot) -> None:
+def test_doctor_reports_an_unlisted_certificate(robot: Gated) -> None:
     ended = robot.tool("unlisted", "doctor")
     assert ended.code == 1
     assert SILENCE in ended.out
 
 
-def test_foxglove_with_a_viewer_s_certificate_shows_and_stops_the_robot(robot: Robot) -> None:
+def test_foxglove_with_a_viewer_s_certificate_shows_and_stops_the_robot(robot: Gated) -> None:
     port = int(free_endpoint().rpartition(":")[2])
     words = ["foxglove", "--address", f"127.0.0.1:{port}", "--connect", robot.tls]
     where = robot.daemon.config.parent
@@ -102,7 +79,7 @@ def test_foxglove_with_a_viewer_s_certificate_shows_and_stops_the_robot(robot: R
 
 @pytest.mark.slow
 def test_the_drive_verb_refuses_an_unlisted_certificate_before_a_key_is_pressed(
-    robot: Robot,
+    robot: Gated,
 ) -> None:
     link = ["--connect", robot.tls, "--tls", robot.own("unlisted")]
     where = robot.daemon.config.parent
@@ -121,7 +98,7 @@ def test_the_drive_verb_refuses_an_unlisted_certificate_before_a_key_is_pressed(
     ids=["clear", "set_pose", "config"],
 )
 def test_a_request_that_a_viewer_may_not_make_is_refused_with_the_role_it_needs(
-    robot: Robot, words: tuple[str, ...], least: str
+    robot: Gated, words: tuple[str, ...], least: str
 ) -> None:
     ended = robot.tool("viewer", *words)
     assert (ended.code, ended.out) == (77, "")

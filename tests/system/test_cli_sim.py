@@ -3,56 +3,17 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from acsard.core.messages.encodings import encode
-from acsard.core.messages.schema import Header, Imu, Quaternion, Vector3
-from acsard.core.ros.attachments import Attachment
-from acsard.core.ros.names import rmw_key
 from tests.system.harness import Bus, Daemon, Peer, running, until
-
-SKIDDING: dict[str, dict[str, object]] = {"sim": {"track_multiplier": 1.6}}
-
-
-@pytest.fixture(scope="module")
-def skidding(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bus]:
-    """Provide a client of a daemon whose simulated robot turns less than its wheels suggest."""
-    where = tmp_path_factory.mktemp("skidding")
-    with running(where, config=SKIDDING) as (_, bus):
-        yield bus
 
 
 def yaw(pose: Any) -> float:
     turn = pose["orientation"]
     return 2 * math.atan2(turn["z"], turn["w"])
-
-
-@pytest.mark.slow
-def test_the_true_pose_differs_from_odometry_by_the_simulated_track_multiplier(
-    skidding: Bus,
-) -> None:
-    with skidding.commanding(0.0, 1.0):
-        until(lambda: skidding.state()["yaw"] > 1.6, 10.0, "most of a quarter turn")
-    skidding.at_rest()
-    believed = yaw(skidding.get("odom")["pose"]["pose"])
-    assert yaw(skidding.get("sim/pose")["pose"]) == pytest.approx(believed / 1.6, rel=0.02)
-
-
-@pytest.fixture(scope="module")
-def real(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bus]:
-    """Provide a client of a daemon on a pty that uses a gyro from the bus."""
-    where, tables = tmp_path_factory.mktemp("real"), {"odometry": {"gyro": True}}
-    with (
-        Peer(where / "mcu") as peer,
-        Daemon(where, port=peer.path, config=tables) as daemon,
-        Bus(daemon.endpoint) as bus,
-    ):
-        bus.linked()
-        yield bus
 
 
 # the gyro
@@ -104,15 +65,3 @@ def test_a_gyro_on_the_bus_is_used_and_its_invalid_samples_are_counted(
         ):
             until(lambda: refused(value, reason), 5.0, f"{reason} is counted")  # noqa: B023
         assert [e for e in daemon.events("imu_refused") if e["level"] == "warning"]
-
-
-def test_a_ros_imu_is_received_on_either_transport(real: Bus) -> None:
-    sample = Imu(
-        Header(), Quaternion(), [0.0] * 9, Vector3(z=51.0), [0.0] * 9, Vector3(), [0.0] * 9
-    )
-    rmw = rmw_key(0, "/imu/data", "sensor_msgs/msg/Imu")
-    attachment = Attachment(1, 10**18, bytes(range(16))).pack()
-    real.session.put("imu/data", encode(sample, "cdr"))
-    until(lambda: real.count("imu_out_of_range") == 1, 5.0, "the bridge's sample is received")
-    real.session.put(rmw, encode(sample, "cdr"), attachment=attachment)
-    until(lambda: real.count("imu_out_of_range") == 2, 5.0, "rmw_zenoh's sample is received")

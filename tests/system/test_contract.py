@@ -12,8 +12,8 @@ from tests.system.contract import PAGE, ROWS, marks, matrix
 from tests.system.doors import Door, Stage
 from tests.system.doors_of_programs import DOORS
 from tests.system.fleet_router import ITS_NAME, certified, robot_at, router
-from tests.system.harness import Bus, Daemon, Tables, free_endpoint
-from tests.system.identities import Certificates, free_tls_endpoint
+from tests.system.harness import Bus, Daemon
+from tests.system.identities import Gated, free_tls_endpoint
 
 NewStage = Callable[[str], Stage]
 
@@ -26,11 +26,10 @@ def plain(where: Path, request: pytest.FixtureRequest) -> Iterator[Stage]:
 
 @contextmanager
 def gateway(where: Path, request: pytest.FixtureRequest) -> Iterator[Stage]:
-    certificates, here, tls = Certificates(where), free_endpoint(), free_tls_endpoint()
-    config: Tables = {"bus": {"listen": [here, tls], "tls": str(certificates.robot)}}
-    with Daemon(where, config=config, endpoint=here) as daemon, Bus(here) as bus:
-        own = certificates.robot / "clients"
-        yield Stage(daemon, bus, where, request, tls, own.joinpath)
+    robot = Gated(where)
+    with robot.daemon as daemon, Bus(robot.plain) as bus:
+        own = robot.certificates.robot / "clients"
+        yield Stage(daemon, bus, where, request, robot.tls, own.joinpath)
 
 
 @contextmanager

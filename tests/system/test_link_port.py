@@ -8,23 +8,18 @@ import errno
 import fcntl
 import itertools
 import os
-import select
 import termios
 import threading
 import time
 import tty
 from collections.abc import Callable, Iterator
-from contextlib import suppress
 from typing import NamedTuple
 
 import pytest
 import serial
 
-from acsard.core.config.settings import McuConfig
 from acsard.core.link.checked_line import seal
-from acsard.core.link.link_setup import LinkSetup
-from acsard.core.link.session import McuSession
-from acsard.core.values import NS_PER_S, STILL, Event, Instant
+from acsard.core.values import Event, Instant
 from acsard.daemon.serial.device import close, open_raw
 from acsard.daemon.serial.port import DRIVER_HUNG, SerialPort
 from acsard.host import clock
@@ -139,29 +134,6 @@ async def test_a_late_step_reads_waiting_bytes_before_it_judges_a_silence(
         assert port.take() == ()
 
 
-async def test_a_reader_called_after_a_late_step_reports_no_hang_up(
-    line: Line,
-) -> None:
-    """A late step reads the waiting bytes, then the event loop calls the reader, which finds none.
-
-    The reader must not take this for a hang-up.
-    """
-    async with line.port() as port:
-        loop, chunks = asyncio.get_running_loop(), list[bytes]()
-
-        def late_step() -> None:
-            chunks.extend(piece.data for piece in port.take(clock.now()))
-
-        for _ in range(10):
-            os.write(line.board, GO)
-            select.select([port._fd], [], [], 5.0)
-            # The reader is in the event loop's list before the loop finds that there is
-            # something to read.
-            loop.call_soon(late_step)
-            await asyncio.sleep(0.001)
-        assert (b"".join(chunks).count(GO), port.is_open, port.trouble) == (10, True, "")
-
-
 async def test_a_line_sent_right_after_the_device_hung_up_is_lost_without_an_error() -> None:
     """The reader and the step can notice the hang-up in the same round of the event loop."""
     loop, errors, names = asyncio.get_running_loop(), list[str](), list[str]()
@@ -213,43 +185,6 @@ async def test_a_device_that_vanishes_while_it_is_opened_is_opened_later(
             assert (event_names[0], event_names[-1]) == ("port_waiting", "port_open")
             keeper.cancel()
             await asyncio.wait([keeper])
-
-
-async def test_a_port_whose_driver_accepts_no_bytes_is_reported_while_it_still_receives(
-    line: Line,
-) -> None:
-    """The simulated board sends reports and reads nothing, so the port's output buffer fills."""
-    os.set_blocking(line.board, False)
-    os.set_blocking(line.device, False)
-    wake, setup, session = asyncio.Event(), LinkSetup.of(McuConfig(), 100.0), McuSession()
-    async with line.port(wake=lambda now: wake.set()) as port:
-
-        async def blocked(link: str) -> bool:
-            """Step until the link is so, and return whether the session calls it blocked."""
-            deadline_ns = clock.mono_ns() + 5 * NS_PER_S
-            while session.link != link and clock.mono_ns() < deadline_ns:
-                os.write(line.board, GO * 2)
-                await asyncio.wait_for(wake.wait(), 5.0)
-                wake.clear()
-                now = clock.now()
-                session.update(setup, now, port.is_open, port.opened, port.take())
-                data = session.line(setup, now.mono_ns, STILL)
-                if data is not None:
-                    written = port.offer(data, now) == "sent"
-                    session.sent(setup, now.mono_ns, was_written=written)
-                await asyncio.sleep(0.01)  # the wire is free again
-            assert session.link == link
-            return session.blocked
-
-        assert not await blocked("up")
-        with suppress(BlockingIOError):
-            while True:
-                os.write(line.device, bytes(4096))
-        assert await blocked("stale")
-        with suppress(BlockingIOError):
-            while True:
-                os.read(line.board, 65536)
-        assert not await blocked("up")
 
 
 async def test_a_released_port_is_closed_with_zeros_and_opened_again(line: Line) -> None:

@@ -163,8 +163,10 @@ def method(*arguments):
     ("module", "kind", "method"),
     [
         ("acsard.daemon.bus.inbox", "Replies", "_reply"),
-        ("acsard.daemon.bus.outlets", "Outlets", "_send"),
-        ("acsard.daemon.bus.router_links", "RouterLinks", "_poll"),
+        pytest.param("acsard.daemon.bus.outlets", "Outlets", "_send", marks=pytest.mark.nightly),
+        pytest.param(
+            "acsard.daemon.bus.router_links", "RouterLinks", "_poll", marks=pytest.mark.nightly
+        ),
     ],
 )
 def test_a_bug_in_a_thread_of_the_bus_ends_the_daemon_with_stop_last(
