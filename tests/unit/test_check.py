@@ -71,11 +71,6 @@ def test_the_examples_of_the_protocol_are_right() -> None:
     assert unseal(line) == Checked(SEED_LINE, 7, reading)
 
 
-@each("line", [SEED_LINE, SEED_LINE + b",", b"", b"hello", SEED_LINE[:9]])
-def test_a_line_without_suffix_is_unchecked(line: bytes) -> None:
-    assert reason(line) == "without_crc"
-
-
 @each(
     "suffix",
     [

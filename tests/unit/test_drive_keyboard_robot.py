@@ -11,7 +11,6 @@ from msgspec.structs import replace
 
 from acsard.bus.address import Address
 from acsard.client.driving import MAX_END_S
-from acsard.client.follower import ROBOT_SILENCE_TIMEOUT_S
 from acsard.client.ride import GRACE_S, RELEASE_TIMEOUT_S
 from acsard.core.messages.schema import RobotState, SourceState
 from acsard.core.values import NS_PER_S
@@ -166,18 +165,6 @@ def test_a_key_that_was_pressed_before_or_in_a_stall_does_not_drive_after_it(
     drive.step(times=10)
     assert set(drive.robot.sent[sent:]) <= {0.0}
     assert drive.step("i", times=4)[-1] == 0.5
-
-
-def test_a_key_drives_no_robot_whose_daemon_is_silent() -> None:
-    drive = Drive()
-    drive.robot.shows = None
-    assert not drive.drives("i", 100)
-    drive = Drive()
-    assert drive.step("i", times=20)[-1] == 0.5
-    assert not drive.ride.screen_data().silent
-    drive.robot.shows = None
-    assert drive.for_s("i", ROBOT_SILENCE_TIMEOUT_S + 0.15)[-1] == 0.0
-    assert drive.ride.screen_data().silent
 
 
 # a held key that the robot does not follow

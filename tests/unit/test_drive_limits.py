@@ -184,23 +184,6 @@ def test_a_goal_within_the_limits_is_reached_exactly_and_held(
     assert ramp.follow(REST, 0.0) == wish  # a step of no duration changes nothing
 
 
-@settings(max_examples=20)
-@given(
-    wishes=st.lists(st.tuples(mixed, periods), max_size=10),
-    goal=mixed,
-    side=st.sampled_from(("left", "right")),
-)
-def test_wheels_of_unequal_size_never_keep_the_robot_from_its_goal(
-    side: str, wishes: list[tuple[Twist, float]], goal: Twist
-) -> None:
-    drive = DriveConfig(**{f"{side}_wheel_radius_multiplier": 0.8})
-    ramp = Ramp(TALL, drive)
-    for wish, dt in wishes:
-        ramp.follow(wish, dt)
-    fresh = Ramp(TALL, drive).follow(goal, 1000.0)
-    assert pair(ramp.path(goal, 2000)[-1]) == near(*pair(fresh))
-
-
 @each("sign", [1.0, -1.0])
 def test_at_the_wheel_limit_one_axis_waits_for_the_other(sign: float) -> None:
     ramp = moving(1.0, 0.0, TALL)

@@ -213,18 +213,6 @@ def test_a_stall_counts_once_if_replies_name_their_line_and_many_are_lost() -> N
             assert total == pytest.approx((left_ns - began_ns) / 1e9, abs=0.005), number
 
 
-def test_late_reads_neither_add_nor_lose_time() -> None:
-    bench = Bench(counts=0, period=0.01)
-    began = bench.now_ns + 10 * MS
-    total = 0.0
-    for number in range(400):
-        late = number % 4  # delay of the read, ms
-        bench.timeline.written(bench.setup, bench.now_ns)
-        total += bench.line(ms=10 + late).dt
-        bench.now_ns -= late * MS
-    assert total == pytest.approx((bench.now_ns - began) / 1e9, abs=0.004)
-
-
 def test_a_free_running_board_that_was_silent_for_a_day_costs_no_period() -> None:
     bench = Bench(counts=0, period=0.01)
     for _ in range(100):

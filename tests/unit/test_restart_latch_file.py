@@ -320,39 +320,6 @@ def test_only_the_newest_latches_are_written_when_the_disk_works_again(
     assert written == [encode("acsar", FAULT), encode("acsar", STOP)]
 
 
-def test_a_flood_of_stops_is_written_at_a_pace(tmp_path: Path, started: Started) -> None:
-    disk = FaultyDisk()
-    file = started(tmp_path, disk)
-    began = time.monotonic()
-    for number in range(40):
-        file.keep(Latches((replace(JOE, number=number),), number))
-        time.sleep(0.005)
-    end(file)
-    written = [data for call, _, data in disk.calls if call == "write"]
-    assert len(written) <= (time.monotonic() - began) / module.MIN_WRITE_PAUSE_S + 3
-    assert b'"number": 39' in written[-1]
-
-
-def test_latches_that_arrive_while_the_file_closes_are_written(
-    tmp_path: Path, started: Started, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    file = started(tmp_path)
-    pop = file._box.pop
-
-    def late() -> Latches | None:
-        latches = pop()
-        if latches is FAULT:  # the thread has taken it; now a stop and the end come at once
-            file.keep(STOP)
-            file._box.close()
-        return latches
-
-    monkeypatch.setattr(file._box, "pop", late)
-    file.keep(FAULT)
-    until(lambda: not file._thread.is_alive())
-    assert (tmp_path / NAME).read_bytes() == encode("acsar", STOP)
-    assert file.trouble, "a thread that has ended is reported"
-
-
 def test_the_close_waits_for_a_stuck_disk_only_until_its_timeout(
     tmp_path: Path, started: Started
 ) -> None:

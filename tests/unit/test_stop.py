@@ -185,19 +185,6 @@ def test_what_stops_the_robot_during_the_shutdown_is_latched_for_the_next_start(
     assert "shutting down" in refusal(lambda: timed.clear(*timed.numbers))
 
 
-def test_a_plain_clear_releases_the_faults_and_the_next_one_the_stops() -> None:
-    timed = Timed()
-    stops = {timed.stop("ann"), timed.stop("joe")}
-    faults = {timed.fault("front_left"), timed.fault("rear_left")}
-    timed.run(SHOWN_S + 0.02)
-    text, done = timed.life.clear(None, ns(timed.now_s))
-    assert set(done) == faults
-    assert text.startswith("cleared, but the robot is still stopped by joe and stopped by ann")
-    assert set(timed.clear()) == stops
-    assert timed.mode is Mode.READY
-    assert timed.clear() == timed.activate() == ()
-
-
 @each("kind", ["stop", "fault", "off"])
 def test_a_plain_call_needs_two_seconds_since_the_newest_cause_was_shown(kind: str) -> None:
     timed = Timed()
