@@ -22,8 +22,8 @@ WAYS = {"gyro": (True, False), "positions": (False, True), "both": (True, True)}
 """Whether the log of a simulated robot has the turn rate of a gyro, and positions."""
 
 
-def ideal(plan: Plan = GUIDED) -> Drive:
-    return drive(replace(Robot(), **IDEAL), plan)  # type: ignore[arg-type]
+def ideal() -> Drive:
+    return drive(replace(Robot(), **IDEAL), GUIDED)  # type: ignore[arg-type]
 
 
 def usual(seed: int = 3, plan: Plan = GUIDED) -> Drive:

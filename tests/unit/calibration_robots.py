@@ -28,14 +28,11 @@ GUIDED: Plan = [
 """The drive that the guide would ask a person for; it lasts 83 s."""
 
 
-def slow_squares(side: float = 1.0, turn: float = 0.3, laps: int = 1) -> Plan:
-    """Return squares at 0.1 m/s with turns on the spot. `turn` is in rad/s; negative to the right.
-
-    One lap with sides of 1 m lasts 74 s.
-    """
+def slow_square(turn: float) -> Plan:
+    """Return a square of 1 m at 0.1 m/s with turns on the spot at `turn` rad/s. It lasts 74 s."""
     corner = (np.pi / 2 / abs(turn), 0.0, turn)
-    edge: Plan = [(side / 0.1, 0.1, 0.0), (1.0, 0.0, 0.0), corner, (1.0, 0.0, 0.0)]
-    return [(3.0, 0.0, 0.0), *edge * (4 * laps), (2.0, 0.0, 0.0)]
+    edge: Plan = [(10.0, 0.1, 0.0), (1.0, 0.0, 0.0), corner, (1.0, 0.0, 0.0)]
+    return [(3.0, 0.0, 0.0), *edge * 4, (2.0, 0.0, 0.0)]
 
 
 def wander(rng: np.random.Generator, seconds: float) -> Plan:

@@ -21,10 +21,8 @@ SLOW = WheelSpeeds(1.0, 1.0, 1.0, 1.0)
 
 
 class LinkBench:
-    def __init__(
-        self, mcu: McuConfig = PLAIN, rate_hz: float = 100.0, longest_reply: float = 0.25
-    ) -> None:
-        self.setup = LinkSetup.of(mcu, rate_hz, longest_reply=longest_reply)
+    def __init__(self, mcu: McuConfig = PLAIN, longest_reply: float = 0.25) -> None:
+        self.setup = LinkSetup.of(mcu, 100.0, longest_reply=longest_reply)
         self.session = McuSession()
         self.now_ns = self.made_ns = 1000 * MS
         self.opened, self.port_open = 0, False

@@ -26,12 +26,12 @@ BY_GYRO, BY_POSES = (1.4925, 0.9950, 1.0050), (1.500, 1.000, 1.010)
 GYRO, POSES = ("--imu", "/imu/data"), ("--positions", "/pose", "--yaw")
 
 
-def found(data: bytes, truth: Sequence[float], within: float = 0.008) -> Result:
+def found(data: bytes, truth: Sequence[float]) -> Result:
     """Calibrate with this log, and compare what is found with the truth."""
     result = calibrate(read(data), Config(), "drive.csv")
     print(result.found, result.deviations)
     assert result.better
-    assert list(result.found.values()) == pytest.approx(truth, abs=within)
+    assert list(result.found.values()) == pytest.approx(truth, abs=0.008)
     # The noise never states more than a few degrees for a sound log.
     noise = result.settings.get("odometry.yaw_variance_per_radian", 0.0)
     assert noise <= Config().odometry.yaw_variance_per_radian

@@ -24,7 +24,7 @@ from tests.unit.calibration_robots import (
     Floats,
     Robot,
     drive,
-    slow_squares,
+    slow_square,
     wander,
 )  # fmt: skip
 
@@ -113,7 +113,7 @@ def slow_drives(seed: int, **other: float) -> list[Drive]:
     fixed: dict[str, float] = {"chi": 1.0, "rate": 0.0, "outliers": 0.0, "slip": 0.003}
     fixed |= {"left": 1.0, "right": 1.0, "place_noise": 0.0016, "place_hz": 20.0}
     robot = Robot(rng=np.random.default_rng(seed), **(fixed | other))  # type: ignore[arg-type]
-    return [drive(robot, slow_squares(turn=turn)) for turn in (0.3, -0.3) * 2]
+    return [drive(robot, slow_square(turn)) for turn in (0.3, -0.3) * 2]
 
 
 @pytest.mark.slow

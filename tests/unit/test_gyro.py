@@ -8,7 +8,6 @@ from collections.abc import Callable
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from msgspec.structs import replace
 
 from acsard.core.config.settings import DriveConfig, OdometryConfig
 from acsard.core.motion.gyro import Gyro, claims
@@ -47,11 +46,8 @@ class Bench:
         self.none, self.does = 0, list[GyroDoes]()
         self.silent = self.other = False  # `other`: the next sample is the first of another sender
         self.distort: Rate = lambda rate: rate  # what the gyro reports instead of the given rate
-        self.held_back_ns = 0  # until then no sample arrives; those that wait then come together
-        self.per_line: int | None = None  # samples that the network delivers in each line
         self._samples = first
         self._way: list[GyroSample] = []
-        self._backlog: list[GyroSample] = []
         self._sampled_ns, self._sampled = self.now_ns, 0.0
         self.true = 0.0
         self.zero()
@@ -71,8 +67,8 @@ class Bench:
             for _ in range(10):
                 self.now_ns += LINE_NS // 10
                 self.true += now * DT / 10
-                self._sample()
-            self.gyro.add_samples(self._arrived())
+                self.sample()
+            self.gyro.add_samples(self.arrived())
             wheels = now * skid * DT
             stands = now == 0.0 if still is None else still
             turn = self.gyro.turn(self.now_ns, DT, wheels, 0.0, stands, CLAIMS)
@@ -86,22 +82,12 @@ class Bench:
                 self.does.append(event.kind)  # type: ignore[arg-type]
         return self
 
-    def _arrived(self) -> tuple[GyroSample, ...]:
-        samples: tuple[GyroSample, ...] = ()
-        if self.now_ns > self.held_back_ns:
-            samples = tuple(
-                replace(sample, at_ns=max(sample.at_ns, self.held_back_ns))
-                for sample in self._way
-                if sample.at_ns <= self.now_ns
-            )
-            self._way = [sample for sample in self._way if sample.at_ns > self.now_ns]
-        if self.per_line is None:
-            return samples
-        self._backlog += samples
-        now, self._backlog = self._backlog[: self.per_line], self._backlog[self.per_line :]
-        return tuple(replace(sample, at_ns=self.now_ns) for sample in now)
+    def arrived(self) -> tuple[GyroSample, ...]:
+        samples = tuple(sample for sample in self._way if sample.at_ns <= self.now_ns)
+        self._way = [sample for sample in self._way if sample.at_ns > self.now_ns]
+        return samples
 
-    def _sample(self) -> None:
+    def sample(self) -> None:
         span_ns = self.now_ns - self._sampled_ns
         if span_ns < self.sample_ns:
             return

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import random
 
 import pytest
 
@@ -19,8 +18,8 @@ def test_the_gyro_gives_the_turn_of_a_gap_in_the_feedback(rate: float) -> None:
     for _ in range(30):
         bench.now_ns += LINE_NS
         bench.true += rate * DT
-        bench._sample()
-    bench.gyro.add_samples(bench._arrived())
+        bench.sample()
+    bench.gyro.add_samples(bench.arrived())
     turn = bench.gyro.turn(bench.now_ns, 0.0, 0.0, 0.0, False, CLAIMS)
     assert turn is not None
     assert turn.angle == pytest.approx(0.3 * rate, abs=1e-6)
@@ -78,31 +77,13 @@ def test_the_variance_contains_the_turn_while_samples_are_missing(
     assert bench.off < 0.02 + 2.0 * math.sqrt(bench.variance)
 
 
-@each("held_s", [0.4, 1.0, 3.0])
-@each("per_line", [2, 3, 10])
-def test_a_backlog_of_samples_does_not_turn_a_robot_that_stands(
-    held_s: float, per_line: int
-) -> None:
-    bench = Bench(noise=0.002, stamped=True).run(2.0, 1.0)
-    bench.zero()
-    bench.per_line = 0
-    bench.run(held_s - 0.3, 2.0).run(0.3, lambda t: 2.0 - t / 0.15)
-    bench.per_line = per_line
-    assert bench.run(1.0 + held_s / (per_line - 1)).off < 0.03
-    assert bench.says == "used"
-    assert bench.run(2.0, 0.5).off < 0.03
-
-
-@each("jitter_ms", [0, 60])
-def test_a_clock_that_was_set_back_in_a_silence_is_believed_after_a_second(jitter_ms: int) -> None:
-    bench, dice = Bench(stamped=True).run(3.0, 1.0), random.Random(1)
+def test_a_clock_that_was_set_back_in_a_silence_is_believed_after_a_second() -> None:
+    bench = Bench(stamped=True).run(3.0, 1.0)
     bench.silent = True
     bench.run(1.0, 1.0)
     bench.silent = False
     bench.clock_ns -= 900 * MS
-    for _ in range(20):
-        bench.held_back_ns = bench.now_ns + dice.randrange(0, jitter_ms + 1) * MS
-        bench.run(0.1, 1.0)
+    bench.run(2.0, 1.0)
     assert bench.does[-2:] == ["silent", "used"]
     assert bench.off < 0.03
 

@@ -9,7 +9,6 @@ import sys
 import time
 from collections.abc import Callable, Coroutine, Iterator
 from contextlib import contextmanager
-from threading import Timer
 from typing import Any
 
 import pytest
@@ -120,20 +119,6 @@ def reading(fd: int, then: Callable[[], object]) -> Callable[[], None]:
         then()
 
     return read
-
-
-def test_a_timer_that_a_reader_starts_runs_in_time() -> None:
-    async def main() -> None:
-        loop, began = asyncio.get_running_loop(), time.monotonic()
-        done = loop.create_future()
-        loop.call_later(4.0, lambda: None)
-        loop.add_reader(fd, reading(fd, lambda: loop.call_later(0.02, done.set_result, 1)))
-        Timer(0.02, os.write, (other, b"x")).start()
-        await done
-        assert 0.03 < time.monotonic() - began < 2.0
-
-    with pipe() as (fd, other):
-        run(main())
 
 
 def test_timers_threads_and_tasks_run_beside_a_reader_that_is_always_ready() -> None:

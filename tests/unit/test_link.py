@@ -10,7 +10,6 @@ from acsard.core.config.settings import FeedbackConfig, McuConfig
 from acsard.core.config.wire_time import wire_ns
 from acsard.core.link.feedback import MIN_INTERVAL_NS
 from acsard.core.link.link_setup import LinkSetup
-from acsard.core.link.link_state import BAD_LINES, GOOD_LINES, Link
 from acsard.core.link.session import LONG_GAP_NS, McuSession
 from acsard.core.values import NS_PER_S, Instant, Received, WheelSpeeds
 from tests.each import each
@@ -119,38 +118,6 @@ def test_a_session_restarts_with_the_port_and_after_a_long_gap(case: str) -> Non
 
 
 # the state of the link
-
-
-class States:
-    """A link to a board that sends a good line every 10 ms."""
-
-    def __init__(self, checked: bool = False) -> None:
-        self.link, self.checked, self.now_ns = Link(), checked, 1000 * MS
-        self.link.apply("opened")
-
-    def good(self, count: int = 1, ms: float = 10, may_rise: bool = True) -> str:
-        for _ in range(count):
-            self.now_ns += int(ms * MS)
-            self.link.good(self.now_ns, 100 * MS)
-            self.link.judge(self.now_ns, may_rise, self.checked)
-        return self.link.state
-
-
-@each(("checked", "state"), [(False, "up"), (True, "stale")])
-def test_bad_lines_alone_take_only_a_checked_link_down_but_are_reported(
-    checked: bool, state: str
-) -> None:
-    states = States(checked)
-    states.link.bad(checked)
-    states.link.judge(states.now_ns, True, checked)
-    assert states.link.state == "booting"
-    assert states.good(1 if checked else GOOD_LINES) == "up"
-    for _ in range(BAD_LINES - 1):
-        states.link.bad(checked)
-    assert (states.link.state, states.link.damaged) == ("up", False)
-    states.link.bad(checked)
-    assert (states.link.state, states.link.damaged) == (state, True)
-    assert (states.good(), states.link.damaged) == ("up", False)
 
 
 # the time of a line

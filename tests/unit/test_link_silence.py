@@ -102,16 +102,16 @@ def test_lines_too_far_apart_are_reported_with_a_setting_only_if_it_is_valid(
 # delays of this computer
 
 
-def after(*steps_ms: int, good: bool = False, setup: LinkSetup = REAL) -> Lateness:
+def after(*steps_ms: int, good: bool = False) -> Lateness:
     """Check the lateness after each of these time steps. A good line arrives at time 0.
 
     `good` says whether another good line arrives in the last step.
     """
     lateness, now_ns = Lateness(), 0
-    lateness.record_step(setup, now_ns, good=True)
+    lateness.record_step(REAL, now_ns, good=True)
     for number, step_ms in enumerate(steps_ms, 1):
         now_ns += step_ms * MS
-        lateness.record_step(setup, now_ns, good=good and number == len(steps_ms))
+        lateness.record_step(REAL, now_ns, good=good and number == len(steps_ms))
     return lateness
 
 
@@ -148,25 +148,15 @@ def test_lines_that_the_host_read_late_give_no_advice_about_the_board(port: str,
     assert codes == {"host_late", code}
 
 
-def sparse(bench: LinkBench) -> str:
-    """Return the first diagnosis of a board that sends three good lines and then nothing."""
-    for tick in range(3 * 100 + 2):
-        bench.wait(10, *([GOOD] if tick % 20 == 1 and tick < 50 else []))
-    heard = bench.session._hearing.heard
-    assert heard is not None
-    assert heard.code == "received_sparse"
-    return heard.diagnosis().code
-
-
 # lines without an answer
 
 
-def events_of(every: int, windows: int = 3, period: float = 0.0, linked: bool = True) -> list[str]:
+def events_of(every: int, period: float = 0.0, linked: bool = True) -> list[str]:
     """Return the events of a link that loses every n-th line."""
     answered = UnansweredLines()
     events = [
         answered.check(sent, sent - sent // every if every else sent, linked, period)
-        for sent in range(windows * WINDOW_LINES + 1)
+        for sent in range(3 * WINDOW_LINES + 1)
     ]
     return [event.text for event in events if event is not None]
 

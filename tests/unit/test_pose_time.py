@@ -42,7 +42,6 @@ class Bench:
         *counts: int,
         ms: float = 10,
         mcu_ms: int | None = None,
-        following: int = 0,
         gap: bool = False,
     ) -> Feedback:
         """Return the feedback of a line `ms` later on both clocks, with or without counts."""
@@ -53,8 +52,8 @@ class Bench:
             a, b, c, d = (count % 65536 for count in counts)
             reading = Reading(self.mcu_ms % 65536, (a, b, c, d))
         at = Instant(self.now_ns, self.now_ns + 7)
-        self.timeline.process_read(self.setup, at, LENGTH, 1, following)
-        return self.timeline.place(self.setup, SPEEDS, reading, following, LENGTH, gap)
+        self.timeline.process_read(self.setup, at, LENGTH, 1, 0)
+        return self.timeline.place(self.setup, SPEEDS, reading, 0, LENGTH, gap)
 
 
 def test_the_first_line_has_a_time_but_neither_dt_nor_gap() -> None:

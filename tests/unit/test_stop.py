@@ -110,8 +110,8 @@ class Timed:
         self.life.hold(PRESSED, ns(self.now_s))
         return self.life.latches.last
 
-    def clear(self, *named: int, asked_s: float | None = None) -> tuple[int, ...]:
-        asked_ns = ns(self.now_s if asked_s is None else asked_s)
+    def clear(self, *named: int) -> tuple[int, ...]:
+        asked_ns = ns(self.now_s)
         return self.life.clear(named or None, asked_ns)[1]
 
     def activate(self, *named: int) -> tuple[int, ...]:
