@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 
-from acsard.core.config.settings import LimitsConfig, OdometryConfig
+from acsard.core.config.settings import OdometryConfig
 from acsard.core.motion.uncertainty import UNKNOWN_POSE
 from acsard.core.values import Estimate, Pose, PoseCovariance
 from tests.each import each
@@ -189,19 +189,6 @@ def driven(accelerations: list[float], gap: tuple[int, int]) -> tuple[float, flo
     return true, estimate.pose.x, math.sqrt(estimate.covariance.xx - 1e-6)
 
 
-@each("seconds", [0.05, 0.15, 0.3, 0.9])
-def test_a_filled_gap_of_a_robot_within_its_limits_is_in_the_covariance(seconds: float) -> None:
-    """The acceleration changes at random in the gap, between the configured limits."""
-    dice, limit = np.random.default_rng(3), LimitsConfig().linear_acceleration
-    length = round(seconds * 100)
-    for _ in range(25):
-        phases = dice.uniform(-limit, limit, 16).repeat(10).tolist()
-        begin = int(dice.integers(20, 100))
-        true, found, std = driven([limit] * 50 + phases, (begin, begin + length))
-        assert abs(found - true) < 3.0 * std
-        assert abs(found - true) <= limit * seconds**2 / 4 + 0.01 * limit * seconds
-
-
 @each("share", [0.0, 0.3, 1.0])
 def test_a_pose_that_is_set_in_a_silence_knows_that_a_part_of_it_came_before(share: float) -> None:
     """The line that ends the silence has the counts of all of it, and none says when they came."""
@@ -214,9 +201,6 @@ def test_a_pose_that_is_set_in_a_silence_knows_that_a_part_of_it_came_before(sha
     assert estimate.positions == pytest.approx((0.1 + turned,) * 4)
     later = robot.fold(counts(0.1, speed=10.0))
     assert later.pose.x - estimate.pose.x == pytest.approx(0.1 * RADIUS)
-
-
-# the error model
 
 
 # a turn that was missed

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 import errno
 import fcntl
 import itertools
@@ -12,15 +11,13 @@ import shutil
 import subprocess
 import termios
 import threading
-import tty
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import get_args
 
 import pytest
 
-from acsard.core.config.settings import Baud, Config, SimConfig
-from acsard.core.simulator.faults import USB_PACKET
+from acsard.core.config.settings import Baud
 from acsard.daemon.serial.device import (
     baud_rate_of,
     close,
@@ -30,7 +27,6 @@ from acsard.daemon.serial.device import (
     set_baud_rate,
     unsent,
 )
-from acsard.daemon.serial.simulator_pty import Simulated
 from acsard.host import clock
 from acsard.host.errors import Exit, InUseError
 from tests.each import each
@@ -187,39 +183,3 @@ def test_a_file_without_an_output_queue_counts_as_drained(path: str) -> None:
     with open(os.devnull) as null:
         assert unsent(null.fileno()) == 0
         assert list(draining(null.fileno(), clock.mono_ns() + 10**9)) == []
-
-
-LINE = b"ap00.00,bp00.00,cp00.00,dp00.00\n"
-
-
-async def first_piece(faults: tuple[str, ...], enough: Callable[[bytes], bool]) -> bytes:
-    """Send lines and read one piece of data after each, until `enough` accepts a piece.
-
-    Return it.
-    """
-    future: asyncio.Future[bytes] = asyncio.get_running_loop().create_future()
-    with Simulated(Config(sim=SimConfig(faults=faults))) as simulated:
-        device = os.open(simulated.path, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
-        tty.setraw(device)
-
-        def more() -> None:
-            piece = os.read(device, 4096)
-            os.write(device, LINE)
-            if enough(piece) and not future.done():
-                future.set_result(piece)
-
-        asyncio.get_running_loop().add_reader(device, more)
-        try:
-            os.write(device, LINE * 12)
-            return await asyncio.wait_for(future, 20.0)
-        finally:
-            asyncio.get_running_loop().remove_reader(device)
-            os.close(device)
-
-
-def test_with_ftdi_replies_come_in_the_adapters_packets_and_not_line_by_line() -> None:
-    def packets(piece: bytes) -> bool:
-        # A late read may also get the rest that the adapter sent after its latency.
-        return len(piece) % USB_PACKET == 0 and not piece.endswith(b"\n")
-
-    assert asyncio.run(first_piece(("ftdi",), packets))

@@ -157,47 +157,32 @@ def independent(line: bytes) -> Motors | None:
 
 def valid(dice: random.Random) -> bytes:
     """Return a random well-formed line in one of the accepted forms."""
-    letters = "abcd" if dice.random() < 0.9 else "".join(dice.sample("abcd", 4))
-    form = dice.choice(("%05.2f", "%05.2f", "%05.2f", "%.2f", "%.3f"))
-    tokens = []
-    for letter in letters:
-        speed = dice.choice((0.0, 9.99, 99.99, *[dice.random() * 99.9] * 9))
-        tokens.append(f"{letter}{dice.choice('pn')}{form % speed}")
-    return (dice.choice((",", ",", ", ")).join(tokens) + dice.choice(("", "", "", ","))).encode()
-
-
-def damaged(dice: random.Random, line: bytes, other: bytes) -> bytes:
-    """Return `line` as a bad wire might deliver it."""
-    place = dice.randrange(len(line))
-    before, after = line[:place], line[place:]
-    match dice.randrange(8):
-        case 0:  # the start or the end is missing
-            return after if dice.random() < 0.5 else before
-        case 1:  # some bytes are missing inside
-            return before + after[dice.randint(1, 9) :]
-        case 2:  # the line runs into the next one, whole or in part
-            return line + dice.choice((b"", b",", b"\r", other)) + other[dice.randrange(30) :]
-        case 3:  # the rest is another line's
-            return before + other[place:]
-        case 4:  # the rest is another line's, shifted
-            return before + other[dice.randrange(len(other)) :]
-        case 5:  # one additional byte
-            return before + dice.randbytes(1) + after
-        case 6:  # a wrong byte of the most harmful kind
-            return before + bytes([dice.choice(b"abcdpn0123456789.,- \r\x00")]) + after[1:]
-        case _:  # flipped bits
-            broken = bytearray(line)
-            for _ in range(dice.randint(1, 2)):
-                broken[dice.randrange(len(broken))] ^= 1 << dice.randrange(8)
-            return bytes(broken)
+    form = dice.choice(("%05.2f", "%05.2f", "%.2f", "%.3f"))
+    speeds = [dice.choice((0.0, 9.99, 99.99, dice.random() * 99.9)) for _ in "abcd"]
+    tokens = [
+        f"{a}{dice.choice('pn')}{form % speed}" for a, speed in zip("abcd", speeds, strict=True)
+    ]
+    return (dice.choice((",", ", ")).join(tokens) + dice.choice(("", "", "", ","))).encode()
 
 
 def wire(dice: random.Random, count: int) -> Iterator[bytes]:
-    """Yield `count` lines in random pieces. One in five lines is undamaged."""
-    other, buffer = valid(dice), b""
+    """Yield `count` lines in random pieces. One in six lines is undamaged."""
+    buffer, other = b"", valid(dice)
     for _ in range(count):
-        line = valid(dice)
-        buffer += line if dice.random() < 0.2 else damaged(dice, line, other)
+        line, place = valid(dice), dice.randrange(20)
+        before, after = line[:place], line[place:]
+        buffer += dice.choice(
+            (
+                line,
+                before + after[dice.randint(1, 19) :],  # bytes are missing
+                line + other[dice.randrange(20) :],  # it runs into the next one
+                before + other[place + dice.choice((0, 0, 3)) :],  # the rest is another line's
+                before
+                + bytes([dice.choice(b"abcdpn0123456789.,- \r\x00")])
+                + after[dice.randrange(2) :],
+                before + bytes([after[0] ^ 1 << dice.randrange(8)]) + after[1:],
+            )
+        )
         buffer += dice.choice((b"\r\n", b"\r\n", b"\n"))
         other, cut = line, dice.randrange(len(buffer) + 1)
         yield buffer[:cut]

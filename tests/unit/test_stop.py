@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import random
 import re
 from collections.abc import Callable
 from pathlib import Path
@@ -20,7 +19,7 @@ from acsard.core.motion.latches import (
     latched,
     stopped,
 )
-from acsard.core.motion.lifecycle import SHOWN_S, Lifecycle
+from acsard.core.motion.lifecycle import Lifecycle
 from acsard.core.motion.modes import REFUSALS, Mode, RefusedError
 from acsard.core.values import NS_PER_S, Cause, CauseKind, Instant, Latches
 from tests.each import each
@@ -224,58 +223,6 @@ def test_only_activate_ends_inactive_and_only_without_a_latched_stop() -> None:
     assert timed.clear(*timed.numbers) == ()
     assert timed.activate(*timed.numbers)
     assert timed.mode is Mode.READY
-
-
-@each("seed", range(60))
-def test_in_any_history_a_call_releases_what_it_names_and_numbers_are_new(seed: int) -> None:
-    """Callers act on states that they read up to 3 s ago; the daemon restarts now and then."""
-    dice, timed = random.Random(seed), Timed(Latches(last=seed))
-    given: set[int] = set()
-    latched_s: dict[int, float] = {}
-    for _ in range(60):
-        timed.run(dice.choice((0.01, 0.3, 1.0, 2.5)))
-        life, before = timed.life, timed.life.latches
-        act = dice.choice(("stop", "stop", "fault", "press", "off", "clear", "activate", "restart"))
-        named = dice.choice(
-            (None, tuple(timed.numbers), tuple(dice.sample(sorted(given), min(3, len(given)))))
-        )
-        try:
-            match act:
-                case "stop":
-                    timed.stop(dice.choice(("ann", "joe", "")))
-                case "fault":
-                    life.fault(dead(dice.choice(("front_left", "rear_left"))), at(timed.now_s))
-                case "press":
-                    timed.press()
-                    timed.life.hold(None, ns(timed.now_s) - 1)
-                case "off":
-                    timed.off(dice.choice(("ann", "joe")))
-                case "restart":
-                    timed = Timed(after_restart(before))
-                    latched_s = dict.fromkeys(timed.numbers, timed.now_s - 0.02)
-                case "clear" | "activate":
-                    call = life.clear if act == "clear" else life.activate
-                    call(named, ns(timed.now_s))
-        except RefusedError:
-            assert life.latches is before
-        after = timed.life.latches
-        left, kinds = set(numbers(after)), {c.kind for c in after.causes}
-        fresh = left - set(numbers(before))
-        assert not fresh & given
-        given |= fresh
-        latched_s |= dict.fromkeys(fresh, timed.now_s)
-        gone = [c for c in before.causes if c.number not in left]
-        if act in ("clear", "activate"):
-            ours = {"fault", "stop"} if act == "clear" else {"inactive"}
-            assert {c.kind for c in gone} <= ours
-            if named is not None:
-                expected = {c.number for c in before.causes if c.number in named and c.kind in ours}
-                blocked = act == "activate" and kinds & {"fault", "stop"}
-                assert blocked or {c.number for c in gone} == expected
-            else:
-                assert all(timed.now_s - latched_s[c.number] >= SHOWN_S for c in gone)
-        else:
-            assert len(gone) <= len(fresh)  # a cause that came again has replaced itself
 
 
 def test_words(approved: Callable[[Path, str], None]) -> None:

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
-from acsard.core.values import NS_PER_S, Command, Twist, Wait
+from acsard.core.values import Command, Wait
 from tests.each import each
 from tests.unit.commanders import GO, MS, TWISTS, Commanders
 
@@ -127,58 +125,3 @@ def test_a_speed_that_a_zero_of_another_clock_overtook_is_not_newer(
     assert send("zero", "other clock", 2) == ("" if proven else "unproven")
     one.wait(wait_ms)
     assert send("go", "", number) == code
-
-
-# the rule as a law
-
-TOGETHER = {"session": Twist(0.3, 0.0), "key": Twist(0.4, 0.0)}
-EACH = {"a": Twist(0.1, 0.0), "b": Twist(0.2, 0.0)} | TOGETHER
-"""One twist per sender; the followed twist shows which sender drives."""
-WAITS = st.sampled_from([0, 20, 100, 249, 251, 300, 600, 999, 1000, 4000])
-KINDS = st.sampled_from(("go", "zero", "cancelled", "nan", "unreadable", "stamped", "neutral"))
-DELAYS = st.sampled_from([0, 60, 200, 249, 260, 400])
-STEPS = st.tuples(WAITS, st.sampled_from([*EACH]), KINDS, DELAYS)
-
-
-@settings(max_examples=100)
-@given(st.lists(STEPS, max_size=30))
-def test_nobody_drives_whom_no_zero_has_armed(story: list[tuple[int, str, str, int]]) -> None:
-    one = Commanders()
-    for name in EACH:
-        one.prove_clock(f"high.{name}")
-    one.play("1 reset; 1")
-    armed: set[str] = set()
-    waiting: dict[str, int] = {}
-    for wait_ms, name, kind, late_ms in story:
-        now_ns, refused, shared = one.wait(wait_ms).now_ns, "", name in TOGETHER
-        armed.update(other for other, at_ns in waiting.items() if now_ns - at_ns >= NS_PER_S)
-        if kind == "neutral":
-            one.play("reset > -")
-            armed, waiting = set(), {}
-            continue
-        if kind == "unreadable":
-            refused = one.act(f"high.{name}", kind) or kind
-        else:
-            twist = EACH[name] if kind in ("go", "stamped") else TWISTS[kind]
-            stamp_ns = now_ns + one.offset_ns - late_ms * MS if kind == "stamped" else None
-            refused = one.accept(
-                Command(
-                    "high", twist, now_ns, stamp_ns, name, name,
-                    cancelled=kind == "cancelled", shared=shared,
-                )
-            )  # fmt: skip
-        zero = kind == "zero" and not refused
-        if zero and not shared:
-            armed.add(name)
-        elif zero:
-            waiting.setdefault(name, now_ns)
-        elif kind == "unreadable":
-            waiting.pop(name, None)
-        elif shared:
-            waiting = {}
-        followed = one.choice().twist
-        if followed == TWISTS["zero"]:
-            assert armed
-        for other, twist in EACH.items():
-            if followed == twist:
-                assert other in armed
