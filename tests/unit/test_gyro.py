@@ -250,6 +250,13 @@ def test_a_gyro_that_later_reports_another_quantity_must_prove_itself_again(
     assert bench.run(1.0, 0.5).says == "used"
 
 
+def test_a_new_pose_ends_the_uncertainty_of_the_turns_before_it() -> None:
+    bench = Bench(noise=0.002).proved().run(0.5, 1.0, 0.2)
+    bench.gyro.forget_doubt()
+    bench.doubt = 0.0
+    assert abs(bench.run(1.0).doubt) < 0.01
+
+
 # uncertainty
 
 
