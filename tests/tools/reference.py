@@ -7,15 +7,18 @@ from __future__ import annotations
 
 import argparse
 import ast
+import inspect
 import re
 from collections.abc import Callable, Iterable, Iterator
 from itertools import pairwise
 from pathlib import Path
+from textwrap import dedent
 from typing import Any
 
 from msgspec.structs import replace
 from prometheus_client.parser import text_string_to_metric_families
 
+from acsard import client
 from acsard.cli.command_line import parser
 from acsard.core.codes import CODES
 from acsard.core.messages.json_schema import SCHEMAS
@@ -200,6 +203,32 @@ def _literal(text: str) -> str:
     )
 
 
+# the client for Python
+
+
+def python_client() -> str:
+    """Return the client's own description, and its methods."""
+    texts = []
+    for text in re.split(r"\n\n(?=\S)", inspect.cleandoc(client.__doc__ or "")):
+        prose, _, code = text.partition("\n\n    ")
+        texts.append(f"{_literal(prose)}\n")
+        if code:
+            texts.append(f"```text\n{dedent(f'    {code}')}\n```\n")
+    rows = []
+    for name, method in inspect.getmembers(client.Client):
+        if not name.startswith("_"):
+            signature = str(inspect.signature(method)) if callable(method) else ""
+            call = f"{name}{signature.replace('(self, ', '(').replace('(self)', '()')}"
+            about = (inspect.getdoc(method) or "").partition("\n\n")[0]
+            rows.append((f"`{call.replace(chr(39), '')}`", _literal(about)))
+    return _page(
+        "The client for Python",
+        "`python -m pydoc acsard.client` prints the same text.",
+        *texts,
+        "## Methods\n\n" + table(("method", "effect"), rows),
+    )
+
+
 # codes
 
 
@@ -299,6 +328,7 @@ GENERATED: dict[str, Callable[[], str]] = {
     f"{PAGES}/settings.md": settings,
     f"{PAGES}/messages.md": messages,
     f"{PAGES}/commands.md": commands,
+    f"{PAGES}/python.md": python_client,
     f"{PAGES}/codes.md": codes,
     f"{PAGES}/http.md": http,
     f"{PAGES}/metrics.md": metrics,
