@@ -1,6 +1,6 @@
 /* A board on the bench: runs the firmware's machine code in libsimavr, behind a pty, with four motors.
  *
- * runner [--baud N] [--free-speed A,B,C,D] [--lag SECONDS] [--deadband DUTY] [--counts N] FIRMWARE.elf
+ * runner [--baud N] [--free-speed A,B,C,D] [--counts N] FIRMWARE.elf
  *
  * It is wired as the page howto/wire of the manual says, from numbers of its own: an error in the firmware's
  * pins is not repeated here. Time is the wall clock's, in slices of half a millisecond; a machine too
@@ -21,16 +21,11 @@
  *   lose to|from PERCENT         so many lines are lost whole, by chance; 0 = none
  *   type WORD                    a line to the board that the host has not sent
  *   unplug, plug                 the port vanishes; a new one appears
- *   auto_reset MS                opening the port resets the board, which boots for that long; 0 = no
- *   supply on|off                the motors' supply
  *   encoder MOTOR ok|dead|swapped
  *   load MOTOR SHARE             the motor turns slower by this share; 1 = it is jammed
- *   push MOTOR SPEED             the wheel has this speed now, rad/s
  *   contact PIN open|closed      what is between digital pin 30 to 37 and ground; open at first
- *   bounce PIN MS                it opens and closes by chance for that long
  *   analog PIN MV                the voltage at analog pin 0 or 1
  *   bench MS                     that much virtual time as fast as it goes
- *   quit
  */
 #define _GNU_SOURCE
 #include <errno.h>
@@ -133,19 +128,19 @@ static avr_ioport_t *port_c, *port_k;
 static avr_irq_t *uart_input, *adc;
 static avr_int_vector_t pin_change;
 
-static double lag = 0.05, deadband, counts_per_turn = 3200;
+static const double lag = 0.05;
+static double counts_per_turn = 3200;
 static double byte_cycles = F_CPU * 10.0 / 115200;
-static bool supply = true, muted, paused, quitting, was_reset, stop_bytes;
-static unsigned resets, auto_reset_ms;
-static avr_cycle_count_t held_until, slept;
+static bool muted, paused, quitting, was_reset, stop_bytes;
+static unsigned resets;
+static avr_cycle_count_t slept;
 static int64_t base_ns, skipped_ns;
 static int64_t on_ns, off_ns, heard_ns; /* in virtual time, as is this: from the last byte heard */
 static int64_t answer_ns;               /* to the first byte of the line that came then */
 static bool motors_run;
 
 /* Bit 0 is pin 37 of the Mega, bit 7 pin 30. */
-static uint8_t closed, bouncing;
-static avr_cycle_count_t bounces_until[8];
+static uint8_t closed;
 static int64_t contact_ns;  /* when a contact was last set */
 static int64_t reported_ns; /* when the board had last sent that the emergency stop changed */
 static bool reported_pressed;
@@ -195,12 +190,7 @@ static uint16_t word(uint16_t address)
 
 static double goal(const struct motor *motor)
 {
-    double size = fabs(motor->duty);
-
-    if (!supply || size <= deadband)
-        return 0.0;
-    return copysign((size - deadband) / (1.0 - deadband), motor->duty) * motor->free_speed *
-           (1.0 - motor->load);
+    return motor->duty * motor->free_speed * (1.0 - motor->load);
 }
 
 /* The first-order lag worked out exactly, so that the steps do not matter. */
@@ -219,7 +209,7 @@ static void advance(struct motor *motor, avr_cycle_count_t to)
     }
     if (aim == 0.0 && motor->speed == 0.0)
         return;
-    rest = lag > 0.0 ? exp(-dt / lag) : 0.0;
+    rest = exp(-dt / lag);
     error = motor->speed - aim;
     motor->position += (aim * dt + error * lag * (1.0 - rest)) * counts_per_turn / (2.0 * M_PI);
     motor->speed = aim + error * rest;
@@ -276,38 +266,18 @@ static avr_cycle_count_t on_motor(avr_t *unused, avr_cycle_count_t when, void *w
 /* An open contact has the level of its pull-up; a pin without one floats, and reads low here. */
 static void show_contacts(void)
 {
-    uint8_t now = (uint8_t)(avr->data[PORTC] & ~avr->data[DDRC] & ~(closed ^ bouncing));
+    uint8_t now = (uint8_t)(avr->data[PORTC] & ~avr->data[DDRC] & ~closed);
 
     avr->data[PINC] = now;
     port_c->external.pull_value = now;
 }
 
-static avr_cycle_count_t on_bounce(avr_t *unused, avr_cycle_count_t when, void *which)
-{
-    int index = (int)(intptr_t)which;
-    avr_cycle_count_t next = when + F_CPU / 20000 + (unsigned)rand() % (F_CPU / 2000);
-
-    (void)unused;
-    bouncing &= (uint8_t)~(1u << index);
-    if (when < bounces_until[index])
-        bouncing |= (uint8_t)((rand() & 1) << index);
-    show_contacts();
-    if (when >= bounces_until[index])
-        return 0;
-    return next < bounces_until[index] ? next : bounces_until[index];
-}
-
-static bool set_contact(bool bounce, int pin, const char *value)
+static bool set_contact(int pin, const char *value)
 {
     int index = 37 - pin;
 
     if (index < 0 || index > 7)
         return false;
-    if (bounce) {
-        bounces_until[index] = avr->cycle + (avr_cycle_count_t)(atof(value) * (F_CPU / 1000));
-        avr_cycle_timer_register(avr, 1, on_bounce, (void *)(intptr_t)index);
-        return true;
-    }
     contact_ns = virtual_ns();
     closed &= (uint8_t)~(1u << index);
     if (!strcmp(value, "closed"))
@@ -624,15 +594,12 @@ static void after_reset(void)
         show_encoder(i);
         avr_cycle_timer_register(avr, 16, on_motor, (void *)(intptr_t)i);
     }
-    bouncing = 0;
     show_contacts();
     look_at_bridges();
 }
 
-static void reset(unsigned boot_ms)
+static void reset(void)
 {
-    if (boot_ms)
-        held_until = avr->cycle + (avr_cycle_count_t)boot_ms * (F_CPU / 1000);
     avr_reset(avr);
     avr->data[MCUSR] = EXTRF;
     after_reset();
@@ -651,14 +618,11 @@ static void look_at_port(void)
 {
     struct pollfd port = {master, POLLIN, 0};
     uint8_t buffer[512];
-    bool was_open = opened;
 
     if (master < 0)
         return;
     poll(&port, 1, 0);
     opened = !(port.revents & POLLHUP);
-    if (opened && !was_open && auto_reset_ms)
-        reset(auto_reset_ms);
     if (!opened)
         outgoing_length = 0;
     while (port.revents & POLLIN && QUEUE - (incoming_head - incoming_tail) >= sizeof buffer) {
@@ -691,16 +655,10 @@ static void run_slice(void)
     avr_cycle_count_t end = avr->cycle + SLICE;
 
     while (avr->cycle < end) {
-        if (avr->cycle < held_until) {
-            /* In reset or in its bootloader: the world goes on without it. */
-            avr->cycle += 500;
-            avr_cycle_timer_process(avr);
-        } else {
-            int state = avr_run(avr);
+        int state = avr_run(avr);
 
-            if (state == cpu_Done || state == cpu_Crashed)
-                fail("the firmware crashed at %#x", avr->pc);
-        }
+        if (state == cpu_Done || state == cpu_Crashed)
+            fail("the firmware crashed at %#x", avr->pc);
         if (was_reset)
             after_reset();
     }
@@ -801,8 +759,6 @@ static bool set_motor(const char *what, const char *letter, const char *value)
     advance(motor, avr->cycle);
     if (!strcmp(what, "load"))
         motor->load = atof(value);
-    else if (!strcmp(what, "push"))
-        motor->speed = atof(value);
     else if (!strcmp(value, "ok"))
         motor->encoder = OK;
     else if (!strcmp(value, "dead"))
@@ -817,7 +773,7 @@ static bool set_motor(const char *what, const char *letter, const char *value)
 static bool obeyed(const char *verb, const char *one, const char *two)
 {
     if (!strcmp(verb, "reset"))
-        reset(0);
+        reset();
     else if (!strcmp(verb, "pause") || !strcmp(verb, "resume"))
         paused = verb[0] == 'p';
     else if (!strcmp(verb, "mute") || !strcmp(verb, "unmute"))
@@ -830,22 +786,12 @@ static bool obeyed(const char *verb, const char *one, const char *two)
         incoming[incoming_head++ % QUEUE] = '\n';
     } else if (!strcmp(verb, "unplug"))
         unplug();
-    else if (!strcmp(verb, "auto_reset"))
-        auto_reset_ms = (unsigned)strtoul(one, NULL, 10);
-    else if (!strcmp(verb, "supply")) {
-        int i;
-
-        for (i = 0; i < MOTORS; i++)
-            advance(&motors[i], avr->cycle);
-        supply = !strcmp(one, "on");
-    } else if (!strcmp(verb, "encoder") || !strcmp(verb, "load") || !strcmp(verb, "push"))
+    else if (!strcmp(verb, "encoder") || !strcmp(verb, "load"))
         return set_motor(verb, one, two);
-    else if (!strcmp(verb, "contact") || !strcmp(verb, "bounce"))
-        return set_contact(verb[0] == 'b', atoi(one), two);
+    else if (!strcmp(verb, "contact"))
+        return set_contact(atoi(one), two);
     else if (!strcmp(verb, "analog"))
         avr_raise_irq(adc + ADC_IRQ_ADC0 + atoi(one), (uint32_t)atoi(two));
-    else if (!strcmp(verb, "quit"))
-        quitting = true;
     else
         return false;
     return true;
@@ -1007,10 +953,6 @@ int main(int count, char **words)
 
         if (!strcmp(words[i], "--baud"))
             byte_cycles = F_CPU * 10.0 / atof(value);
-        else if (!strcmp(words[i], "--lag"))
-            lag = atof(value);
-        else if (!strcmp(words[i], "--deadband"))
-            deadband = atof(value);
         else if (!strcmp(words[i], "--counts"))
             counts_per_turn = atof(value);
         else if (!strcmp(words[i], "--free-speed"))

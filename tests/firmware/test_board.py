@@ -228,38 +228,6 @@ def test_counts_and_milliseconds_give_the_speed_without_the_line_s_jitter(
     assert all(turn == pytest.approx(-30.0, abs=0.8) for turn in turns)
 
 
-def test_the_milliseconds_of_a_reply_are_the_board_s_clock(board: Board, host: Host) -> None:
-    first, began = host.ask(checked(ZERO, 1, "S")), board.status()
-    until(lambda: board.status().virtual_ns > began.virtual_ns + 1000 * MS, 10.0, "a second")
-    second, ended = host.ask(checked(ZERO, 2, "S")), board.status()
-    assert first.milliseconds is not None
-    assert second.milliseconds is not None
-    elapsed_ms = (second.milliseconds - first.milliseconds) % 65536
-    assert elapsed_ms == pytest.approx((ended.virtual_ns - began.virtual_ns) / MS, abs=25)
-
-
-@pytest.mark.nightly
-def test_the_counts_wrap_and_go_on(board: Board, host: Host) -> None:
-    replies = host.drive((40.0, -40.0, 40.0, -40.0), 4.0)
-    total = [0] * 4
-    for before, after in itertools.pairwise(replies):
-        for i in range(4):
-            total[i] += difference(before.counts[i], after.counts[i])
-    is_still(board)
-    last = host.ask(checked(ZERO, 7, "S"))
-    true = [motor.since_reset for motor in board.status().motors]
-    total = [
-        start + sum_ + difference(end, now)
-        for start, sum_, end, now in zip(
-            (difference(0, count) for count in replies[0].counts), total, replies[-1].counts,
-            last.counts, strict=True,
-        )
-    ]  # fmt: skip
-    print("counts", total, "true", true)
-    assert min(abs(count) for count in true) > 65536
-    assert total == true
-
-
 # under stress
 
 
@@ -348,33 +316,6 @@ def test_an_overflow_of_the_receive_buffer_does_not_damage_the_next_line(
         assert 0 < answered < 12
 
 
-def test_a_port_that_vanishes_stops_the_board_and_a_new_one_works(board: Board, host: Host) -> None:
-    host.drive(DRIVE, 0.3)
-    # The board hears the whole last line. Otherwise it might hear a part of it and then nothing.
-    passes(board, 30)
-    board.command("unplug")
-    status = until(lambda: s if is_off(s := board.status()) else None, 3.0, "motors off")
-    assert 250 <= (status.off_ns - status.heard_ns) / MS <= 350
-    with Host(board.plug()) as again:
-        again.drive(DRIVE, 0.3)
-        assert board.status().running
-
-
-def test_opening_the_port_resets_a_board_with_auto_reset(board: Board, host: Host) -> None:
-    until(lambda: board.status().open, 3.0, "it is seen that the port is open")
-    board.command("auto_reset 300")
-    with Host(board.path) as another:  # it is open already, so nothing happens
-        another.drive(DRIVE, 0.1)
-    assert board.status().resets == 0
-    path = board.plug()
-    with Host(path) as again:
-        until(lambda: board.status().resets == 1, 3.0, "a reset")
-        began = time.monotonic()
-        assert again.says(b"acsard") == BY_PIN
-        print(f"boots for {1000 * (time.monotonic() - began):.0f} ms")
-        stays_off(board, 100)
-
-
 def is_cut(board: Board, host: Host, speeds: Speeds, within: float) -> Status:
     """Drive until the firmware switches off all motors because one wheel does not obey."""
     began = board.status().virtual_ns
@@ -407,19 +348,6 @@ def test_a_wheel_with_its_encoder_backwards_is_cut(board: Board, host: Host) -> 
 
 
 @in_steps
-def test_a_wheel_with_a_dead_encoder_is_cut_after_a_second_of_full_voltage(
-    board: Board, host: Host
-) -> None:
-    board.command("encoder b dead")
-    host.stop()
-    began = board.status().virtual_ns
-    status = is_cut(board, host, (20.0, 20.0, 20.0, 20.0), 2.0)
-    print(f"20 rad/s asked of a dead encoder: off after {(status.off_ns - began) / MS:.0f} ms")
-    assert 1000 <= (status.off_ns - began) / MS <= 1300
-    stays_cut(board, host)
-
-
-@in_steps
 def test_a_reset_frees_motors_that_were_cut(board: Board, host: Host) -> None:
     board.command("encoder b swapped")
     is_cut(board, host, (9.0, 9.0, 9.0, 9.0), 0.8)
@@ -429,26 +357,6 @@ def test_a_reset_frees_motors_that_were_cut(board: Board, host: Host) -> None:
     host.stop()
     host.drive(DRIVE, 0.2)
     assert board.status().running
-
-
-@pytest.mark.nightly
-def test_coarse_encoders_are_driven_reported_and_never_cut(runner: Path, tmp_path: Path) -> None:
-    coarse = build_firmware(tmp_path, "'-DCOUNTS_PER_TURN=2 * 4 * 12'")
-    with (
-        Board(runner, coarse, "--counts", "96") as board,
-        Host(board.path, board) as host,
-        board.in_steps(),
-    ):
-        for speed in (0.4, -0.4, 20.0, -20.0, 1.0, -1.0):
-            host.drive((speed, -speed, speed, speed), 0.5)
-        host.drive((0.5, 0.5, -0.5, 0.5), 2.0)
-        reports = [reply.speeds[0] for reply in host.drive((0.5, 0.5, -0.5, 0.5), 3.0)]
-        true = statistics.mean(reports)
-        print(f"0.5 rad/s at 96 counts a turn: says {true:.2f} +- {statistics.pstdev(reports):.2f}")
-        assert true == pytest.approx(0.5, rel=0.15)
-        assert max(reports) < 2.0
-        assert host.identity()[:1] == (96,)
-        assert host.identity().runaways == 0
 
 
 def test_at_the_lowest_pwm_frequency_the_duty_rises_to_the_top(

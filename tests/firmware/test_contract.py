@@ -208,8 +208,8 @@ def test_a_pressed_emergency_stop_is_off_reported_and_kept_until_zeros(
         status = board.status()
         off, said = (at - status.contact_ns for at in (status.off_ns, status.reported_ns))
         print(f"pressed -> off after {off / MS:.1f} ms, on the line after {said / MS:.1f} ms")
-        assert 0 < off <= 12 * MS
-        assert 0 < said <= 12 * MS
+        assert 0 < off <= (12 if sketched else 5) * MS
+        assert 0 < said <= (12 if sketched else 10) * MS
         host.send(STOP)
         assert not drives(), "zeros count only after the release"
         board.command(f"contact {ESTOP} closed")

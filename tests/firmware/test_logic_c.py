@@ -119,15 +119,8 @@ def test_the_watchdog_allows_for_300_ms_after_each_feeding_however_the_clock_wra
             assert logic.watchdog_allows(at, (now + ms) % 2**32) == (ms < 300)
         now = (now + step) % 2**32
         assert logic.watchdog_allows(at, now) == (step < 300)
-
-
-def test_a_tripped_watchdog_stays_tripped_when_the_clock_wraps(logic: ctypes.CDLL) -> None:
-    dog = WatchdogC()
-    at = ctypes.addressof(dog)
-    logic.watchdog_start(at)
-    logic.watchdog_feed(at, 1000)
-    assert not logic.watchdog_allows(at, 1300)
-    assert not logic.watchdog_allows(at, 1001), "49 days later"
+        if step >= 300:
+            assert not logic.watchdog_allows(at, (now - step) % 2**32), "tripped, 49 days later"
 
 
 # speed
@@ -185,24 +178,6 @@ def test_the_measured_speed_of_a_wheel_that_stopped_falls_to_zero(
     assert speeds == sorted(speeds, reverse=True)
     assert speeds[-1] == 0.0
     assert next(ms for ms, value in enumerate(speeds, 5) if value == 0.0) <= 105
-
-
-def test_the_first_edges_after_a_rest_make_no_spike(logic: ctypes.CDLL) -> None:
-    """A resting wheel starts at 1 rad/s in the middle of a window.
-
-    The measured speed does not exceed 1 rad/s.
-    """
-    for late in range(1, 10):
-        wheel = SpeedC()
-        at = ctypes.addressof(wheel)
-        logic.speed_start(at, 0, 0)
-        for ms in range(0, 300, 10):
-            logic.speed_update(at, 0, 0, ms * 2000)
-        began = 290 * 2000 + late * 2000
-        first = began + round(math.tau / COUNTS_PER_TURN * TICKS)
-        count = max(0, 1 + math.floor((300 * 2000 - first) * COUNTS_PER_TURN / math.tau / TICKS))
-        edge = round(began + count * math.tau / COUNTS_PER_TURN * TICKS)
-        assert logic.speed_update(at, count, edge, 300 * 2000) <= 1.0
 
 
 def edges_of(angle: Callable[[float], float], seconds: float, step: float) -> list[tuple[int, int]]:
@@ -276,34 +251,6 @@ def test_for_any_edges_the_measured_speed_is_at_most_what_the_window_allows(
         before = value
 
 
-CHATTER = [(9_900 + 20_000 * i + 200 * j, 1 - j) for i in range(40) for j in (0, 1)]
-"""The wheel crosses an edge and returns after 100 us, on either side of the end of a window."""
-
-
-@each(
-    "edges",
-    [CHATTER, [(time + 100_000 * (i % 2), count) for i, (time, count) in enumerate(CHATTER[:2])]],
-)
-def test_a_wheel_that_trembles_on_an_edge_has_a_measured_speed_of_zero(
-    logic: ctypes.CDLL, edges: list[tuple[int, int]]
-) -> None:
-    for window in (10_000, 20_000, 40_000):
-        speeds = [value for _, value, _, _ in said_of(logic, edges, [window] * 200)]
-        assert set(speeds) == {0.0}
-
-
-@each(("amplitude", "frequency"), [(0.8, 50), (0.8, 23), (1.5, 37), (3.0, 11)])
-def test_a_trembling_wheel_s_measured_speed_is_bounded_by_its_true_speed(
-    logic: ctypes.CDLL, amplitude: float, frequency: int
-) -> None:
-    """The speed is at most the fastest true speed plus one count per window."""
-    omega = math.tau * frequency
-    edges = edges_of(lambda t: 0.5 + amplitude * math.sin(omega * t), 1.0, 1e-5)
-    for window in (10_000, 20_000, 40_000):
-        speeds = [value for _, value, _, _ in said_of(logic, edges, [window] * 200)]
-        assert max(map(abs, speeds)) <= (amplitude * omega + TICKS / window) * PITCH
-
-
 @pytest.mark.slow
 @each("speed", [0.2, 0.3, 0.4, 0.5, 0.6, 0.9, 2.0, -0.2, -0.6])
 def test_a_coarse_encoder_measures_the_true_speed_also_at_low_speed(
@@ -317,15 +264,6 @@ def test_a_coarse_encoder_measures_the_true_speed_also_at_low_speed(
         assert sum(settled) / len(settled) == pytest.approx(speed, rel=0.1)
         assert max(map(abs, settled)) < 1.1 * abs(speed)
         assert max(abs(value) for _, value, _, _ in samples) < 1.1 * abs(speed), "at the first edge"
-
-
-def test_a_quick_start_after_a_long_rest_is_measured_without_delay(logic: ctypes.CDLL) -> None:
-    for waited in (0, 40_000, 10_000_000, 2**30 - 4_500):
-        last = waited + 20_000
-        edges = [(5_000, 1), *((last - 4_000 + 1_000 * i, 2 + i) for i in range(5))]
-        samples = list(said_of(logic, edges, [10_000, *([waited] * bool(waited)), 10_000]))
-        assert samples[-1][0] == 5
-        assert samples[-1][1] >= 4 * PITCH / 0.005 * 0.999
 
 
 def test_the_first_edge_after_a_rest_longer_than_the_clock_gives_no_high_speed(
@@ -525,19 +463,6 @@ def test_a_wheel_with_its_encoder_backwards_is_switched_off(
     assert wheel.off_ms is not None
     if lag <= 0.05:
         assert wheel.off_ms <= 500
-
-
-@each("touched", [0.2, 0.5, -2.0, 10.0])
-def test_a_wheel_with_its_encoder_backwards_that_is_touched_is_switched_off(
-    logic: ctypes.CDLL, touched: float
-) -> None:
-    wheel = Wheel(logic, encoder=BACKWARDS)
-    assert not wheel.run(0.0, 1000)
-    wheel.speed = touched
-    assert wheel.run(0.0, 2000)
-    assert wheel.off_ms is not None
-    print(f"touched to {touched} rad/s: off after {wheel.off_ms - 1000} ms")
-    assert wheel.off_ms - 1000 <= (500 if abs(touched) >= 0.5 else 600), "growing from nothing"
 
 
 @pytest.mark.parametrize("target", [3.0, 20.0, -45.0])

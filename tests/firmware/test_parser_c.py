@@ -253,11 +253,6 @@ def test_a_stream_is_split_into_lines_as_on_the_host(parser: Parser, data: bytes
     assert parser.lines(data) == [line for line, _ in reader.feed(data)]
 
 
-def test_noise_without_a_line_end_is_forgotten_and_the_next_line_counts(parser: Parser) -> None:
-    assert parser.stream(b"a" * 1000 + SEED_LINE + b"\n" + ZERO + b"\n") == [Command((0, 0, 0, 0))]
-    assert parser.stream(b" " * (127 - len(ZERO)) + ZERO + b"\r\n") == []
-
-
 def test_lines_of_128_bytes_or_more_are_counted_as_too_long(parser: Parser) -> None:
     before = parser.too_long
     parser.stream(b"a" * 1000 + b"\n" + ZERO + b"\n" + b"b" * 127 + b"\n" + b"c" * 128 + b"\n")
@@ -370,14 +365,6 @@ def test_no_part_of_a_line_is_valid_after_a_byte_became_a_line_end(parser: Parse
                     assert not commands, (line, at, end)
 
 
-def test_no_single_bit_error_that_makes_a_line_end_leaves_a_valid_line(parser: Parser) -> None:
-    for line in (checked(SEED_LINE, 7, "S"), checked(SEED_LINE + b",", 0x2A), SEED_LINE):
-        for bit in range(8 * len(line)):
-            bad = _with(line, bit // 8, line[bit // 8] ^ (1 << bit % 8))
-            if b"\n" in bad:
-                assert parser.stream(bad + b"\r\n") == [], bad
-
-
 # the identity
 
 
@@ -395,10 +382,6 @@ def test_the_identity_line_is_readable_by_the_host_and_not_taken_for_feedback(
     assert text.startswith(b"!acsard-mcu 1 counts=3200 watchdog_ms=300 check=1 sample=1 ")
     with pytest.raises(FrameError):
         Codec(WheelMap()).decode(text)
-
-
-def test_the_longest_identity_line_has_126_bytes(parser: Parser) -> None:
-    assert len(parser.identity(2**32 - 1, 65535, 65535, 65535, b"brown-out")) == 126
 
 
 def test_counts_configured_as_a_product_are_reported_as_a_number(

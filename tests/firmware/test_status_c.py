@@ -96,17 +96,6 @@ def test_firmware_as_delivered_never_sends_a_status_line(library: ctypes.CDLL) -
     assert not inputs.stopped
 
 
-@pytest.mark.parametrize("bit", range(5))
-def test_each_contact_is_reported_within_four_samples_in_its_own_field(
-    inputs: Inputs, bit: int
-) -> None:
-    inputs.boot()
-    assert inputs.lines(CLOSED, 500)[-1] == BoardStatus(estop=False, bumpers=(False,) * 4)
-    bumpers = tuple(number == bit - 1 for number in range(4))
-    assert inputs.lines(CLOSED ^ (1 << bit), 4) == [BoardStatus(estop=bit == 0, bumpers=bumpers)]
-    assert inputs.stopped == (bit == 0)
-
-
 def test_contacts_are_reported_ten_times_a_second_and_values_once(inputs: Inputs) -> None:
     inputs.boot()
     statuses = inputs.lines(CLOSED, 10_000, (512, 512))
@@ -117,16 +106,6 @@ def test_contacts_are_reported_ten_times_a_second_and_values_once(inputs: Inputs
     )
     values = BoardStatus(driver_fault=False, volts=16.5, amps=0.0)
     assert [status for status in statuses if status.estop is None] == [values] * 10
-
-
-def test_a_press_is_reported_before_the_fault_of_a_driver_that_lost_its_supply(
-    inputs: Inputs,
-) -> None:
-    inputs.boot()
-    inputs.lines(CLOSED, 997, (0, 0))
-    statuses = inputs.lines(1, 4, (0, 0))  # at 1000 ms both lines are due
-    assert [status.estop for status in statuses] == [True, None]
-    assert statuses[1].driver_fault
 
 
 def test_no_contact_is_reported_before_its_state_is_known(inputs: Inputs) -> None:
@@ -158,30 +137,6 @@ def test_a_contact_is_released_only_by_20_free_samples_and_pressed_by_three(
                 since -= 1
                 free = 0 if samples[since] else free + 1
             assert inputs.stopped == (sum(samples[since:]) >= 3), samples
-
-
-def test_a_bounce_of_two_ms_is_no_release_and_a_disturbance_of_two_ms_is_no_press(
-    inputs: Inputs,
-) -> None:
-    inputs.boot()
-    inputs.lines(CLOSED, 100)
-    for length in (1, 2):
-        assert not any(status.estop for status in inputs.lines(CLOSED ^ 1, length))
-        assert not any(status.estop for status in inputs.lines(CLOSED, 30))
-    inputs.lines(CLOSED ^ 1, 10)
-    for _ in range(100):
-        statuses = inputs.lines(CLOSED, 2) + inputs.lines(CLOSED ^ 1, 3)
-        assert all(status.estop is not False for status in statuses)
-        assert inputs.stopped
-
-
-def test_a_loose_wire_counts_as_pressed(inputs: Inputs) -> None:
-    inputs.boot()
-    inputs.lines(CLOSED, 100)
-    for _ in range(4):
-        inputs.lines(CLOSED ^ 1, 1)
-        inputs.lines(CLOSED, 18)
-    assert inputs.stopped
 
 
 @pytest.mark.slow
