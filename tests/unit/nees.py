@@ -70,11 +70,6 @@ def square(_: np.random.Generator) -> Legs:
     return side * 12
 
 
-def there_and_back(_: np.random.Generator) -> Legs:
-    way = [(0.8, 0.0, 25.0), (0.0, 0.0, 0.8)]
-    return [*way, (0.0, 1.2, math.pi / 1.2), (0.0, 0.0, 0.3), *way]
-
-
 def straight(_: np.random.Generator) -> Legs:
     return [(1.0, 0.0, 60.5), (0.0, 0.0, 1.0)]
 
@@ -96,7 +91,6 @@ SCENARIOS: dict[str, Scenario] = {
     "circle": circle,
     "square": square,
     "random": random,
-    "there and back": there_and_back,
     "straight": straight,
 }
 

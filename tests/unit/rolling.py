@@ -112,7 +112,6 @@ class Bench:
         self.signs: dict[int, int] = {}  # of encoders
         self.frozen: dict[int, float] = {}  # encoders that repeat a speed
         self.slips: dict[int, float] = {}  # factor of the motion of a wheel
-        self.rolled = [0.0] * 4  # rad, magnitudes
         self.said = Findings()
         self.cap = math.inf
 
@@ -136,7 +135,6 @@ class Bench:
             moved = (before + speed) / 2 * dt * self.slips.get(i, 1.0)
             moved *= self.dice.uniform(0.95, 1.05) if self.rough else 1.0
             self.angles[i] += moved
-            self.rolled[i] += abs(moved)
             counted = math.floor(self.angles[i] / self.unit)
             counts, self.counted[i] = counted - self.counted[i], counted
             counts = 0 if i in self.dead else counts * self.signs.get(i, 1)
@@ -151,7 +149,6 @@ class Bench:
             (first, second, third, fourth), reported, dt, None, self.feedback, self.kinematics,
             self.count,
         )  # fmt: skip
-        self.reported = speeds
         for event in wheels.events:
             said.first.setdefault(event.code or event.kind, self.now)
         if wheels.fault is not None:

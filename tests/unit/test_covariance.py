@@ -10,7 +10,7 @@ from hypothesis import given, settings
 
 from acsard.core.config.settings import OdometryConfig
 from acsard.core.motion.uncertainty import UNKNOWN_POSE
-from acsard.core.values import Estimate, Pose, PoseCovariance
+from acsard.core.values import Pose, PoseCovariance
 from tests.each import each
 from tests.unit.nees import PERIOD, RADIUS, TRACK
 from tests.unit.odometer import Odometer
@@ -204,26 +204,6 @@ def test_a_pose_that_is_set_in_a_silence_knows_that_a_part_of_it_came_before(sha
 
 
 # a turn that was missed
-
-
-def astray(missed: float, steps: int) -> tuple[Odometer, Estimate]:
-    """Drive straight on at 1 m/s, with a heading that is wrong by this deviation."""
-    robot = Odometer()
-    robot.odometry.uncertainty.miss("gyro", 0.0, missed, 0.0)
-    return robot, [robot.fold(line(20.0)) for _ in range(steps)][-1]
-
-
-@each("missed", [0.3, 0.7, 1.5, 4.0])
-def test_after_a_missed_turn_each_axis_is_as_uncertain_as_the_robots_are_apart(
-    missed: float,
-) -> None:
-    _, estimate = astray(missed, 500)
-    headings = np.random.default_rng(1).normal(0.0, missed, 10_000)
-    along, aside = 5.0 * (np.cos(headings) - 1.0), 5.0 * np.sin(headings)
-    stated = math.sqrt(estimate.covariance.xx), math.sqrt(estimate.covariance.yy)
-    for axis, errors in zip(stated, (along, aside), strict=True):
-        assert axis > 0.9 * float(np.sqrt((errors**2).mean()))
-    assert max(stated) < 5.0 * (missed + 1.5)
 
 
 # the twist

@@ -34,7 +34,6 @@ FOLLOWED = replace(
     sender="joe/1/aa",
     sources=[SourceState("teleop", 100, 0.02, "", "nothing")],
 )
-RESTING = replace(FOLLOWED, linear=0.0, angular=0.0)
 STOPPED = replace(FOLLOWED, mode="stopped", reason="stopped by request", source="")
 ZERO_FIRST = replace(
     FOLLOWED,
@@ -125,19 +124,6 @@ def test_only_a_drive_after_a_silence_is_led_by_a_zero_and_a_space_stops_at_the_
     assert drive.step(" ") == [0.0]
 
 
-def test_a_zero_is_repeated_until_the_state_shows_that_the_robot_rests() -> None:
-    drive = Drive()
-    drive.step("i", times=5)
-    assert drive.step("k", times=18) == [0.0] * 18
-    assert drive.step("m", times=2) == [-0.5, -0.5]  # a key drives meanwhile
-    drive.step("k", times=18)
-    drive.robot.shows = RESTING
-    drive.step()
-    assert drive.step(times=100) == []
-    drive.ride.end()
-    assert drive.step() == []
-
-
 def test_a_drive_that_ends_repeats_its_zero_for_two_seconds_at_most() -> None:
     drive = Drive()
     drive.step("i", times=3)
@@ -194,22 +180,6 @@ def test_a_key_that_is_held_while_the_robot_ceases_to_follow_does_not_drive_afte
     assert not drive.drives("i")
     drive.robot.shows = FOLLOWED
     assert not drive.drives("", round(pause / 0.05))
-    assert not drive.drives("i")
-
-
-@each("mode", ["waiting", "ready"])
-def test_a_held_key_drives_on_after_a_short_time_without_effect_but_not_after_a_long_one(
-    mode: str,
-) -> None:
-    """The link to the board, or a source with a higher priority, comes and goes."""
-    away = replace(FOLLOWED, mode=mode, source="")
-    drive = held(away)
-    assert any(drive.for_s("i", GRACE_S - 0.2))
-    drive.robot.shows = FOLLOWED
-    assert drive.drives("i")
-    drive.robot.shows = away
-    drive.for_s("i", GRACE_S + 0.1)
-    drive.robot.shows = FOLLOWED
     assert not drive.drives("i")
 
 

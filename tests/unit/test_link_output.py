@@ -2,18 +2,14 @@
 
 from __future__ import annotations
 
-import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from msgspec.structs import replace
 
-from acsard.core.config.settings import McuConfig, WheelMap
-from acsard.core.config.wire_time import wire_ns
+from acsard.core.config.settings import McuConfig
 from acsard.core.link.checked_line import SAMPLE_REQUEST, seal
 from acsard.core.link.serial_output import SerialOutput
-from acsard.core.values import STILL, WheelSpeeds
 from tests.each import each
-from tests.unit.link_bench import CHECKED, GOOD, MS, PLAIN, SLOW, STOP, LinkBench
+from tests.unit.link_bench import CHECKED, MS, PLAIN, STOP, LinkBench
 from tests.vectors.lines import ZERO
 
 COMMA_STOP = STOP[:-2] + b",\r\n"
@@ -134,48 +130,4 @@ def test_a_session_begins_with_a_plain_stop_and_the_question_follows_the_first_l
     assert bench.line() != b"?\r\n"
 
 
-# a blocked output
-
-
 # when rest was commanded
-
-FREE = McuConfig(reply_period=0.01)
-WIRED = replace(FREE, wheels=WheelMap("-d", "+c", "-b", "+a"))
-WIRE_MS = wire_ns(len(GOOD), 115200) / MS
-
-
-def driven_ms(bench: LinkBench, *lines: tuple[WheelSpeeds, float]) -> object:
-    """Write these lines, let the given time in ms pass after each, and then receive a good line.
-
-    Returns the time from the last sample before these lines to the command to rest, ms.
-    """
-    for speeds, ms in lines:
-        bench.line(speeds)
-        bench.wait(ms)
-    (feedback,) = bench.wait(0, GOOD)
-    return pytest.approx(1000 * feedback.driven - WIRE_MS)
-
-
-@each("mcu", [FREE, replace(FREE, trailing_comma=True), WIRED])
-def test_a_line_tells_when_rest_was_commanded_after_the_last_motion(mcu: McuConfig) -> None:
-    moves, rests = (SLOW, 10.0), (STILL, 10.0)
-    bench = LinkBench(mcu).up()
-    assert driven_ms(bench, moves, moves, rests, rests) == 20
-    assert driven_ms(bench, rests, rests) == -20  # before that line
-    assert driven_ms(bench, moves, rests, moves, rests) == 30
-
-
-def test_zeros_that_did_not_leave_command_no_rest_and_checked_ones_do() -> None:
-    bench = LinkBench(FREE).up()
-    bench.line(SLOW)
-    bench.wait(10)
-    for left in (False, True):
-        bench.line(STILL)
-        bench.update(left)
-    assert driven_ms(bench) == 20
-    bench = LinkBench(CHECKED).checked()
-    bench.line(SLOW)
-    bench.wait(10)
-    answer = bench.answer(bench.line(STILL))
-    (feedback,) = bench.wait(10, answer)
-    assert 1000 * feedback.driven == pytest.approx(10 + wire_ns(len(answer), 115200) / MS)

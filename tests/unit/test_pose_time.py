@@ -51,9 +51,43 @@ class Bench:
         if counts:
             a, b, c, d = (count % 65536 for count in counts)
             reading = Reading(self.mcu_ms % 65536, (a, b, c, d))
+        (sample,) = self.read(0, reading=reading, gap=gap)
+        return sample
+
+    def read(
+        self,
+        ms: float,
+        lines: int = 1,
+        reading: Reading | None = None,
+        gap: bool = False,
+        asked_ns: int | None = None,
+    ) -> list[Feedback]:
+        """Read this many lines at once, `ms` later. With `gap`, the first one follows a silence."""
+        self.now_ns += int(ms * MS)
         at = Instant(self.now_ns, self.now_ns + 7)
-        self.timeline.process_read(self.setup, at, LENGTH, 1, 0)
-        return self.timeline.place(self.setup, SPEEDS, reading, 0, LENGTH, gap)
+        self.timeline.process_read(self.setup, at, LENGTH * lines, lines, 0)
+        return [
+            self.timeline.place(
+                self.setup, SPEEDS, reading, LENGTH * left, LENGTH, gap and left == lines - 1,
+                asked_ns,
+            )
+            for left in reversed(range(lines))
+        ]  # fmt: skip
+
+    def sends(self, ms: float) -> None:
+        """Let a line leave `ms` from now."""
+        self.timeline.written(self.setup, self.now_ns + int(ms * MS))
+
+    def answered(
+        self, sent_ms: float, came_ms: float, *lost: float, gap: bool = False
+    ) -> list[Feedback]:
+        """Read at `came_ms` the answer to a line that left at `sent_ms`; `lost` are later lines."""
+        began_ns = 9000 * MS
+        self.now_ns = began_ns + int(sent_ms * MS)
+        for ms in (0, *lost):
+            self.sends(ms)
+        self.now_ns = began_ns
+        return self.read(came_ms, gap=gap, asked_ns=began_ns + int(sent_ms * MS))
 
 
 def test_the_first_line_has_a_time_but_neither_dt_nor_gap() -> None:
@@ -61,12 +95,8 @@ def test_the_first_line_has_a_time_but_neither_dt_nor_gap() -> None:
     sample = bench.line()
     made_ns = bench.now_ns - WIRE_NS
     assert sample.at == Instant(made_ns, made_ns + 7)
-    assert (sample.speeds, sample.dt, sample.gap, sample.heard_ns) == (
-        SPEEDS,
-        0.0,
-        0.0,
-        bench.now_ns,
-    )
+    found = sample.speeds, sample.dt, sample.gap, sample.heard_ns
+    assert found == (SPEEDS, 0.0, 0.0, bench.now_ns)
 
 
 Line = dict[str, Any]
@@ -118,23 +148,7 @@ def test_counts_have_the_wheel_map_and_are_used_only_if_they_are_configured() ->
     assert bench.line(10, 10, 10, 10).turned is None
 
 
-# boards for which only the reads give the time
-
-
-def read(bench: Bench, ms: float, lines: int, silent: bool = False) -> list[Feedback]:
-    """Read this many lines at once, `ms` after the last read.
-
-    With `silent`, the first line follows a silence.
-    """
-    bench.now_ns += int(ms * MS)
-    at = Instant(bench.now_ns, bench.now_ns + 7)
-    bench.timeline.process_read(bench.setup, at, LENGTH * lines, lines, 0)
-    return [
-        bench.timeline.place(
-            bench.setup, SPEEDS, None, LENGTH * (lines - i), LENGTH, silent and i == 1
-        )
-        for i in range(1, lines + 1)
-    ]
+# boards without counts
 
 
 @pytest.mark.parametrize("period", [20, 50])
@@ -142,29 +156,27 @@ def test_a_board_with_its_own_rate_has_its_own_period(period: int) -> None:
     bench = Bench(counts=0, period=period / 1000)
     for _ in range(80):
         bench.line(ms=period)
-    samples = read(bench, period * 6, 6, silent=True)
+    samples = bench.read(period * 6, 6, gap=True)
     assert [(f.dt, f.gap) for f in samples] == [(period / 1000, 0.0)] * 6
 
 
-# boards that answer each line
-
-
-def prompted(bench: Bench, lines: int = 60) -> Bench:
+def prompted() -> Bench:
     """Send a line every 10 ms, and let the board answer it 8 ms later.
 
     The host stalls once. The missing answers in this stall show that the board is prompted.
     """
-    for number in range(lines):
-        bench.timeline.written(bench.setup, bench.now_ns + 2 * MS)
+    bench = Bench(counts=0)
+    for number in range(80):
+        bench.sends(2)
         bench.line(ms=160 if number == 50 else 10)
         if number == 50:
-            bench.timeline.written(bench.setup, bench.now_ns - 8 * MS)
+            bench.sends(-8)
     return bench
 
 
 def test_the_dt_of_an_answer_is_the_time_between_the_prompting_lines() -> None:
-    bench = prompted(Bench(counts=0), 80)
-    bench.timeline.written(bench.setup, bench.now_ns + 202 * MS)
+    bench = prompted()
+    bench.sends(202)
     sample = bench.line(ms=210, gap=True)
     assert sample.dt == pytest.approx(0.21, abs=1e-3)
     assert (sample.gap, sample.bridged) == (0.0, 0.0)
@@ -172,44 +184,31 @@ def test_the_dt_of_an_answer_is_the_time_between_the_prompting_lines() -> None:
 
 def test_replies_that_waited_in_a_stall_beyond_the_open_commands_cover_no_time_of_it() -> None:
     """A prompted board samples only when a command arrives, and no command arrived in the stall."""
-    bench = prompted(Bench(counts=0), 80)
-    bench.timeline.written(bench.setup, bench.now_ns + 2 * MS)
-    bench.now_ns += 1200 * MS
-    bench.timeline.process_read(bench.setup, Instant(bench.now_ns, bench.now_ns), 3 * LENGTH, 3, 0)
-    samples = [bench.timeline.place(bench.setup, SPEEDS, None, 0, LENGTH, False) for _ in range(3)]
+    bench = prompted()
+    bench.sends(2)
+    samples = bench.read(1200, 3)
     assert sum(line.dt for line in samples) < 0.03
     assert all(line.gap == line.bridged == 0.0 for line in samples)
 
 
 def test_the_dt_of_an_answer_that_names_its_line_is_that_of_the_named_lines() -> None:
     bench = Bench(counts=0)
-    for number, ms in enumerate((0, 10, 20, 37)):
-        bench.timeline.written(bench.setup, 10**9 + ms * MS)
-        bench.now_ns += (10, 3, 25, 1)[number] * MS
-        bench.timeline.process_read(bench.setup, Instant(bench.now_ns, bench.now_ns), LENGTH, 1, 0)
-        sample = bench.timeline.place(bench.setup, SPEEDS, None, 0, LENGTH, False, 10**9 + ms * MS)
-        assert sample.asked_ns == 10**9 + ms * MS
-        assert sample.dt == pytest.approx((0.0, 0.01, 0.01, 0.017)[number], abs=0.0005)
+    for sent_ms, came_ms, dt in ((0, 10, 0.0), (10, 13, 0.01), (20, 38, 0.01), (37, 39, 0.017)):
+        (sample,) = bench.answered(sent_ms, came_ms)
+        assert sample.dt == pytest.approx(dt, abs=0.0005)
 
 
 def test_a_stall_counts_once_if_replies_name_their_line_and_many_are_lost() -> None:
     bench, total = Bench(counts=0), 0.0
-    began_ns = bench.now_ns
     for number in range(200):
         # A stall of 100 ms begins behind line 100. The reply to that line waits for its end.
-        left_ns = began_ns + (10 * number + 100 * (number > 100)) * MS
-        bench.timeline.written(bench.setup, left_ns)
-        if number < 95:
-            # The replies to these lines are lost.
-            bench.timeline.written(bench.setup, left_ns + 3 * MS)
-            bench.timeline.written(bench.setup, left_ns + 6 * MS)
-        came_ns = bench.now_ns = left_ns + (109 if number == 100 else 9) * MS
-        bench.timeline.process_read(bench.setup, Instant(came_ns, came_ns), LENGTH, 1, 0)
-        total += bench.timeline.place(
-            bench.setup, SPEEDS, None, 0, LENGTH, number == 100, left_ns
-        ).dt
+        sent_ms = 10 * number + 100 * (number > 100)
+        lost = (3, 6) if number < 95 else ()  # the replies to these lines
+        late = 109 if number == 100 else 9
+        (sample,) = bench.answered(sent_ms, sent_ms + late, *lost, gap=number == 100)
+        total += sample.dt
         if number > 90:
-            assert total == pytest.approx((left_ns - began_ns) / 1e9, abs=0.005), number
+            assert total == pytest.approx(sent_ms / 1000, abs=0.005), number
 
 
 def test_a_free_running_board_that_was_silent_for_a_day_costs_no_period() -> None:
