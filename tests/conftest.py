@@ -73,7 +73,7 @@ Its unit is a loop of a million empty rounds, because computers differ: 18 ms wh
 MARKS = {"slow", "soak", "bench", "network", "systemd", "firmware", "languages", "bridge"}
 
 LOUD = (
-    "test_board.py", "test_bus.py", "test_daemon.py", "test_link_faults.py", "test_bus_faults.py",
+    "test_board.py", "test_daemon.py", "test_link_faults.py", "test_bus_faults.py",
     "test_inputs.py", "test_access_isolation.py", "test_page_attacks.py", "test_page_lets_go.py",
     "test_lateness_period.py", "test_recording_disks.py",
     "test_access_strangers.py",

@@ -670,9 +670,7 @@ def unharmed(daemon: Daemon) -> None:
 SDK = """\
 import json, sys, time
 
-import zenoh, zenoh.ext
 import zenoh_ros2_sdk as sdk
-import zenoh_ros2_sdk.keyexpr, zenoh_ros2_sdk.subscriber
 from rosbags.typesys import Stores, get_typestore
 
 port, hashes = int(sys.argv[1]), json.loads(sys.argv[2])
@@ -700,26 +698,11 @@ def follow(topic, type_name, qos=None):
         topic, type_name, lambda message: last.__setitem__(topic, message), qos=qos,
         **definition(type_name), **router)
 
-def late(topic, type_name):
-    # As rmw_zenoh's nodes do it; the SDK's own way does not find a topic in a namespace.
-    manager.register_message_type(definition(type_name)["msg_definition"], type_name)
-    dds_type = sdk.subscriber.ros2_to_dds_type(type_name)
-    key = sdk.keyexpr.topic_keyexpr(0, topic, dds_type, "RIHS01_" + hashes[type_name])
-    def on_sample(sample):
-        last[topic] = manager.store.deserialize_cdr(sample.payload.to_bytes(), type_name)
-    subscribers[topic] = zenoh.ext.declare_advanced_subscriber(
-        manager.session, key, on_sample, subscriber_detection=True,
-        history=zenoh.ext.HistoryConfig(detect_late_publishers=True, max_samples=100),
-        recovery=zenoh.ext.RecoveryConfig(periodic_queries=None, heartbeat=True))
-
 def newest(topic):
     last.pop(topic, None)
     end = time.monotonic() + 5
     while topic not in last and time.monotonic() < end:
         time.sleep(0.005)
-    return last.get(topic)
-
-def held(topic):
     return last.get(topic)
 
 def message(type_name, **fields):
@@ -779,7 +762,7 @@ def nodes(topic):
     return info and [(p.node_namespace, p.node_name, p.qos) for p in info.publishers]
 
 print("ready", flush=True)
-verbs = {f.__name__: f for f in (follow, late, newest, held, drive, call, topics, services, nodes)}
+verbs = {f.__name__: f for f in (follow, newest, drive, call, topics, services, nodes)}
 for line in sys.stdin:
     number, verb, args, kwargs = json.loads(line)
     try:

@@ -153,11 +153,11 @@ def test_the_zeros_of_a_program_behind_routers_release_no_other_program(
         begun = time.monotonic()
 
         def sends() -> Any:
-            """Send a zero, and also a speed, except between 4 and 6 s. Return the state."""
+            """Send a zero, and also a speed, except between 2 and 4 s. Return the state."""
             state = put(zeros, 0.0)
-            return state if 4.0 < time.monotonic() - begun < 6.0 else put(speeds, 0.1)
+            return state if 2.0 < time.monotonic() - begun < 4.0 else put(speeds, 0.1)
 
-        while time.monotonic() < begun + 4.0:
+        while time.monotonic() < begun + 2.0:
             assert sends()["mode"] != "driving"
             time.sleep(0.05)
         state = until(

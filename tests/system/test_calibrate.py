@@ -180,7 +180,8 @@ def test_a_daemon_that_dies_ends_the_leg(tmp_path: Path) -> None:
         assert program.ended(15.0) == Exit.UNREACHABLE
 
 
-@pytest.mark.soak
+@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.timeout(300)
 def test_the_simulator_is_calibrated_by_its_true_pose_without_a_person(tmp_path: Path) -> None:
     with running(tmp_path, config=SKIDDING) as (daemon, _):

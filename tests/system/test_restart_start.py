@@ -162,17 +162,16 @@ def test_a_second_daemon_with_the_same_id_behind_one_router_ends_with_75(
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("ros", [{"rmw": False}, {"bridge": False, "namespace": "lab/robot"}])
 @pytest.mark.nightly
 def test_a_second_robot_with_the_ros_names_of_another_behind_one_router_ends_with_75(
-    tmp_path: Path, peer: Peer, ros: dict[str, object]
+    tmp_path: Path, peer: Peer
 ) -> None:
     """The second daemon refuses to start, because one `cmd_vel` would drive both robots."""
     endpoint = free_endpoint()
 
     def robot(name: str, port: str = "sim") -> Tables:
         bus = {"listen": [free_endpoint()], "connect": [endpoint]}
-        return {"robot": {"id": name}, "bus": bus, "ros": ros, "mcu": {"port": port}}
+        return {"robot": {"id": name}, "bus": bus, "mcu": {"port": port}}
 
     path = write_config(tmp_path / "two.toml", robot("two", str(peer.path)))
     run = acsard("run", "--config", str(path))

@@ -119,13 +119,6 @@ def test_an_independent_client_drives_the_robot_behind_a_router_as_a_peer_or_a_c
         assert not [key for key in after["counters"] if key.startswith("command_")]
 
 
-def test_an_independent_client_that_comes_late_gets_the_static_transforms(fleet: Fleet) -> None:
-    fleet.sdk.do("late", "/one/tf_static", TF)
-    message = until(lambda: fleet.sdk.do("held", "/one/tf_static"), 1.5, "tf_static")
-    frames = [(t["header"]["frame_id"], t["child_frame_id"]) for t in message["transforms"]]
-    assert frames == [("base_link", "lidar_link")]
-
-
 def test_an_independent_client_stops_and_clears_the_robot(fleet: Fleet) -> None:
     assert fleet.sdk.do("call", "/one/acsard/stop", TRIGGER)["success"] is True
     assert fleet.one.state()["mode"] == "stopped"

@@ -92,9 +92,6 @@ def test_the_service_runs_after_install_and_leaves_no_file_after_a_purge(bare: C
     assert bare.show("UnitFileState") == "enabled"
     status = bare.run(ACSARD, "service", "status")
     assert (status.code, status.out.count("as installed")) == (0, 5)
-    assert bare.run("chmod", "600", RULES).code == 0
-    assert bare.run(ACSARD, "service", "install").code == 0
-    assert bare.run("stat", "-c", "%a", RULES).out.strip() == "644"
     # The service uses neither the clone nor its venv.
     maps = Path(f"/proc/{bare.main_pid()}/maps").read_text()
     assert f"{VERSIONS}/" in maps
@@ -247,28 +244,6 @@ def test_the_service_s_page_lists_and_serves_recordings_and_cannot_change_them(
     assert bare.run(ACSARD, "service", "uninstall", "--purge").code == 0
     assert not bare.path(STATE).exists()
     assert not bare.path(f"{STATE}-web").exists()  # a new instance accepts no old invitation
-
-
-def test_a_foreign_file_is_not_overwritten_without_force(bare: Container) -> None:
-    unit = f"/etc/systemd/system/{UNIT}"
-    bare.write(unit, "[Service]\nExecStart=/bin/true\n")
-    refused = bare.run(ACSARD, "service", "install")
-    assert refused.code == 1
-    assert unit in refused.err
-    assert not bare.path(CONFIGURATION).exists()
-    assert bare.path(unit).read_text().endswith("/bin/true\n")
-    assert bare.run(ACSARD, "service", "install", "--force").code == 0
-    assert bare.show("ActiveState") == "active"
-
-
-@pytest.mark.nightly
-def test_an_existing_configuration_is_kept_by_install_and_uninstall(bare: Container) -> None:
-    own = '[robot]\nid = "mine"\n'
-    bare.write(CONFIGURATION, own)
-    assert bare.run(ACSARD, "service", "install").code == 0
-    assert bare.path(CONFIGURATION).read_text() == own
-    assert "keep    /etc/acsard  " in bare.run(ACSARD, "service", "uninstall").out
-    assert bare.path(CONFIGURATION).read_text() == own
 
 
 def test_only_root_installs(bare: Container) -> None:
