@@ -367,26 +367,13 @@ STANDING = (0.0, 0.0, 0.0, 0.0)
 Reply = Callable[[Speeds], bytes]
 
 
-def form(
-    separator: str = ",", end: str = "\r\n", pad: int = 2, decimals: int = 2, comma: str = ""
-) -> Reply:
-    """Return a function that builds replies in one of the formats of MCU.md section 1.
-
-    The replies report the requested speeds.
-    """
-
-    def reply(speeds: Speeds) -> bytes:
-        width = pad + 1 + decimals
-        tokens = [
-            f"{motor}{'n' if speed < 0 else 'p'}{abs(speed):0{width}.{decimals}f}"
-            for motor, speed in zip("abcd", speeds, strict=True)
-        ]
-        return (separator.join(tokens) + comma + end).encode()
-
-    return reply
-
-
-PLAIN = form()
+def plain_reply(speeds: Speeds) -> bytes:
+    """Return the reply that reports the requested speeds, as MCU.md section 1 has it."""
+    tokens = [
+        f"{motor}{'n' if speed < 0 else 'p'}{abs(speed):05.2f}"
+        for motor, speed in zip("abcd", speeds, strict=True)
+    ]
+    return (",".join(tokens) + "\r\n").encode()
 
 
 def silence(speeds: Speeds) -> bytes:
@@ -425,7 +412,7 @@ class Peer:
     symbolic link to the pty, as udev creates it.
     """
 
-    def __init__(self, path: Path, reply: Reply = PLAIN) -> None:
+    def __init__(self, path: Path, reply: Reply = plain_reply) -> None:
         self.path = path
         self.reply = reply
         self.sessions: list[Session] = []

@@ -642,23 +642,6 @@ def behind(bus: Bus, send: Callable[[], None], reason: str) -> None:
     until(counted, 3.0, f"counted as {reason}")
 
 
-def settled(bus: Bus) -> None:
-    """Wait until the robot is at rest, then set its pose to the origin.
-
-    The pose must stay the same for ten lines, because one reading may miss a slow motion.
-    """
-
-    def look() -> bool:
-        first = bus.at_rest()
-        lines = bus.count("lines_sent")
-        until(lambda: bus.count("lines_sent") >= lines + 10, 3.0, "ten more lines")
-        last = bus.state()
-        return all(first[key] == last[key] for key in ("x", "y", "yaw"))
-
-    until(look, 5.0, "settled")
-    assert bus.get("srv/reset_odometry")["success"]
-
-
 def unharmed(daemon: Daemon) -> None:
     assert daemon.process.poll() is None
     for word in ("Traceback", "Error", "panicked"):

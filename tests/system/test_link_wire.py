@@ -13,7 +13,6 @@ import pytest
 
 from tests.system.bystander import lost
 from tests.system.harness import (
-    PLAIN,
     STANDING,
     ZERO,
     ZERO_LINE,
@@ -23,6 +22,7 @@ from tests.system.harness import (
     Peer,
     ReceivedMessage,
     Tables,
+    plain_reply,
     silence,
     twist,
     until,
@@ -148,7 +148,7 @@ def test_a_silent_board_is_reported_gets_only_zeros_and_drives_on_after_a_short_
         assert bus.state()["x"] == pose
         # After a silence under a second the commander is still armed, and the ramp starts from
         # zero.
-        peer.reply = PLAIN
+        peer.reply = plain_reply
         again = until(lambda: _moving_since(peer, zeros[-1].at), 5.0, "driving again")
         assert wheels(again)[0] <= 20 * 0.05 + 0.01
 
@@ -176,7 +176,7 @@ def _moving_since(peer: Peer, after: float) -> bytes | None:
 @pytest.mark.slow
 def test_noise_between_good_replies_costs_only_itself(tmp_path: Path, peer: Peer) -> None:
     noise = itertools.cycle([b"\x00\xff\xfe\r\n", b"ap10.0\n", b"", b"\r\n\r\n"])
-    peer.reply = lambda speeds: next(noise) + PLAIN(speeds)
+    peer.reply = lambda speeds: next(noise) + plain_reply(speeds)
     with running(tmp_path, peer) as bus, bus.commanding(0.5):
         until(lambda: bus.state()["x"] > 0.3, 5.0, "it drives")
         state = bus.comes_to("driving")

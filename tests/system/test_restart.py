@@ -17,7 +17,6 @@ from typing import Any, Literal, NamedTuple
 import pytest
 
 from tests.system.harness import (
-    PLAIN,
     ROOT,
     ZERO_LINE,
     Bus,
@@ -28,6 +27,7 @@ from tests.system.harness import (
     environment,
     finish,
     free_endpoint,
+    plain_reply,
     running,
     until,
     write_config,
@@ -111,9 +111,9 @@ def latch(robot: Robot, bus: Bus, kind: Kind) -> None:
         case "inactive":
             assert bus.get("srv/deactivate")["success"]
         case "fault":
-            robot.peer.reply = lambda speeds: PLAIN((99.0, 99.0, 99.0, 99.0))
+            robot.peer.reply = lambda speeds: plain_reply((99.0, 99.0, 99.0, 99.0))
             until(lambda: bus.state()["mode"] == "fault", 5.0, "a fault")
-            robot.peer.reply = PLAIN
+            robot.peer.reply = plain_reply
             # The fault has no caller, so no answer waits for the file.
             until(lambda: is_latched(robot, kind), 1.0, "the fault is in the file")
 

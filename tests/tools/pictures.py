@@ -22,7 +22,7 @@ from tests.scenarios.taped import drive_through_faults, happenings, recorded_wor
 from tests.system.browser import NAME, TRUSTING, Page
 from tests.system.camera_stream import Stream
 from tests.system.chromium import DESKTOP, PHONE, SIDEWAYS, Browser, browsing
-from tests.system.harness import PLAIN, Bus, Daemon, Peer, acsard, finish, until
+from tests.system.harness import Bus, Daemon, Peer, acsard, finish, plain_reply, until
 
 VIEWS = ("drive", "status", "events", "set")
 
@@ -130,7 +130,7 @@ class _States:
             look("driving", "DRIVING")
             browser.lift()
             bus.at_rest()
-            usual, board.reply = board.reply, lambda speeds: PLAIN((-speeds[0], *speeds[1:]))
+            usual, board.reply = board.reply, lambda speeds: plain_reply((-speeds[0], *speeds[1:]))
             with bus.commanding(0.3):
                 look("wheel-fault", "FAULT", "Fault")
                 assert "wheel is left out" in browser.text("doubt")
@@ -148,7 +148,7 @@ class _States:
             bus.get("srv/deactivate")
             look("inactive", "INACTIVE", "Switched off")
             bus.get("srv/activate")
-            board.reply = lambda speeds: PLAIN((99.0, 99.0, 99.0, 99.0))
+            board.reply = lambda speeds: plain_reply((99.0, 99.0, 99.0, 99.0))
             look("fault", "FAULT", "Fault")
             board.unplug()
             look("fault-no-board", "FAULT · NO BOARD", "The board is missing, too.")
