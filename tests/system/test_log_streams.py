@@ -36,7 +36,11 @@ def opened(streams: str, stack: ExitStack) -> dict[str, Any]:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("streams", ["closed", "readerless", "full", "blocked"])
+@pytest.mark.parametrize(
+    "streams",
+    ["closed", "blocked"]
+    + [pytest.param(name, marks=pytest.mark.nightly) for name in ("readerless", "full")],
+)
 def test_control_goes_on_and_ends_well_when_no_stream_can_be_written(
     tmp_path: Path, peer: Peer, streams: str
 ) -> None:

@@ -98,16 +98,7 @@ def test_a_ramp_longer_than_0_6_s_is_cut_there_with_stop_last(tmp_path: Path, pe
         assert last_speed(ramp) > 20.0, "it was still fast when its time was up"
 
 
-# The test repeats it: a STOP that is discarded after the last line is lost once in five to ten
-# runs.
-@pytest.mark.parametrize(
-    "second",
-    [
-        signal.SIGTERM,
-        pytest.param(signal.SIGINT, marks=pytest.mark.slow),
-        pytest.param(signal.SIGTERM, id="SIGTERM again", marks=pytest.mark.slow),
-    ],
-)
+@pytest.mark.parametrize("second", [signal.SIGTERM, signal.SIGINT])
 def test_a_second_signal_cuts_the_ramp(tmp_path: Path, peer: Peer, second: signal.Signals) -> None:
     config = {"limits": SLOW_STOP}
     with running(tmp_path, peer.path, config) as (daemon, bus), bus.commanding(2.0):
