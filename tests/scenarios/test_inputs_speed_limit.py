@@ -8,10 +8,9 @@ import msgspec
 import pytest
 
 from acsard.core.config.settings import Config
-from acsard.core.messages.schema import ServiceReply
-from acsard.core.values import Plain
 from tests.each import each
 from tests.scenarios.test_restart import MemoryFile
+from tests.scenarios.test_settings import config, sets
 from tests.scenarios.world import START, World
 from tests.stepped import Outputs
 
@@ -26,17 +25,6 @@ def world() -> World:
 def limit(world: World, value: float, **fields: Any) -> None:
     world.put("speed_limit", msgspec.json.encode({"speed_limit": value} | fields))
     world.run(0.15)
-
-
-def sets(world: World, **settings: Plain) -> ServiceReply:
-    """Call `set` with these settings. Two underscores in a name stand for a dot."""
-    wishes = {key.replace("__", "."): value for key, value in settings.items()}
-    return world.call("set", msgspec.json.encode({"settings": wishes}))
-
-
-def config(world: World) -> Config:
-    (reply,) = world.ask("config")
-    return msgspec.json.decode(reply.payload, type=Config)
 
 
 def fastest(world: World) -> list[float]:
