@@ -1,16 +1,23 @@
-"""A replay of a recording gives identical bytes, and detects any changed byte."""
+"""A replay gives identical bytes, detects any changed byte, and goes on after damage."""
 
 from __future__ import annotations
+
+import random
+from pathlib import Path
 
 import pytest
 from msgspec.structs import replace
 
 from acsard.core.config.named_faults import FAULTS
-from acsard.core.config.settings import Config
+from acsard.core.config.settings import Config, RecordConfig
 from acsard.core.link.serial_output import Offered
 from acsard.core.robot import Robot
 from acsard.core.values import Instant
-from acsard.recording.replay import Replay
+from acsard.host.errors import RecordingError
+from acsard.recording import recorder as module
+from acsard.recording.file import Head, Recording, listed
+from acsard.recording.recorder import Recorder
+from acsard.recording.replay import Playback, Replay
 from tests.scenarios.taped import (
     INPUTS,
     WITH_ARGUMENTS,
@@ -132,3 +139,128 @@ def test_a_replay_with_other_limits_reports_the_first_line_that_differs() -> Non
     assert first.what == ("line", "sent line")
     assert first.recorded.status.mode == first.replayed.status.mode == "driving"
     assert comparison.max_wheel_speeds == (1000, 600)  # 0.5 and 0.3 m/s on wheels of 0.05 m
+
+
+# A replay goes on after damage in a recording, and says which steps it has not compared
+
+
+SECONDS = 100
+
+FRAME_S = 20
+"""Longest part of a drive that damage at one place costs, but for the half second beside it."""
+
+DAMAGED_BYTES = (1, 16, 512, 4096)
+"""Sizes of the damaged places: among them a sector and a page."""
+
+
+@pytest.fixture(scope="module")
+def long(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A recording by the real recorder of a drive in virtual time, with changes of a setting."""
+    dice, where = random.Random(1), tmp_path_factory.mktemp("record")
+    # With the default rate the recording and each replay would take 4 s each.
+    config = replace(
+        Config(),
+        control=replace(Config().control, rate=10.0),
+        record=RecordConfig(str(where), 1000.0),
+    )
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(module, "WRITE_PAUSE_S", 1000.0)
+        patched.setattr(module, "CLOSE_S", 20.0)
+        recorder = Recorder(config, lambda event: None)
+        world = World(config, recorder=recorder)
+        world.drive(0.5, 0.2, seconds=1.0)
+        for second in range(SECONDS):
+            if second % 25 == 12:
+                settings = b'{"settings": {"limits.linear_speed": %.1f}}' % dice.uniform(0.5, 0.9)
+                assert world.call("set", settings).success
+            speed = 0.0 if second % 30 < 5 else dice.uniform(-0.8, 0.8)
+            world.hold(speed, dice.uniform(-1.0, 1.0), seconds=1.0)
+            recorder._writer.write(recorder._take_queue(), False)
+        recorder.close()
+    (path,) = listed(where)
+    return path
+
+
+def played(path: Path, other: Config | None = None) -> tuple[list[int], Playback, Recording]:
+    recording = Recording([path])
+    playback = Playback(recording, other)
+    return [step.number for step, _ in playback.steps()], playback, recording
+
+
+@pytest.fixture(scope="module")
+def whole(long: Path) -> list[int]:
+    """The numbers of all steps."""
+    numbers, playback, recording = played(long)
+    assert (playback.comparison.same, playback.comparison.exact) == (True, True)
+    assert (playback.gaps, recording.damage) == ([], [])
+    heads = [record for record in recording.records() if isinstance(record, Head)]
+    assert len(heads) >= SECONDS // FRAME_S
+    assert len({head.config for head in heads}) > 3
+    return numbers
+
+
+def judge(path: Path, whole: list[int]) -> None:
+    """Replay a damaged copy of the recording."""
+    numbers, playback, recording = played(path)
+    assert playback.comparison.same, playback.comparison.first
+    assert playback.comparison.exact
+    assert len(recording.damage) <= 1
+    lost = sorted(set(whole) - set(numbers))
+    assert recording.damage or not lost
+    # A gap is between steps; the first or the last frame may be missing, too.
+    between = [number for number in lost if numbers[0] < number < numbers[-1]]
+    assert sum(gap.steps for gap in playback.gaps) == len(between)
+    assert len(lost) <= len(whole) * (FRAME_S + 1.0) / SECONDS * 1.2
+
+
+@pytest.mark.variations(4)
+@pytest.mark.parametrize("seed", range(4))
+def test_damage_costs_one_frame(seed: int, long: Path, whole: list[int], tmp_path: Path) -> None:
+    dice, data = random.Random(seed), bytearray(long.read_bytes())
+    at, size = dice.randrange(len(data)), DAMAGED_BYTES[seed]
+    for place in range(at, min(at + size, len(data))):
+        data[place] ^= 0xA5
+    path = tmp_path / "damaged"
+    path.write_bytes(data)
+    judge(path, whole)
+
+
+def test_a_damaged_beginning_costs_the_first_frame(
+    long: Path, whole: list[int], tmp_path: Path
+) -> None:
+    data = bytearray(long.read_bytes())
+    data[:64] = bytes(64)
+    path = tmp_path / "damaged"
+    path.write_bytes(data)
+    judge(path, whole)
+
+
+def test_another_configuration_stays_in_force_after_damage(
+    long: Path, whole: list[int], tmp_path: Path
+) -> None:
+    data = bytearray(long.read_bytes())
+    middle = len(data) // 2
+    data[middle : middle + 16] = bytes(16)
+    path = tmp_path / "damaged"
+    path.write_bytes(data)
+    other = replace(Config(), limits=replace(Config().limits, angular_speed=0.3))
+    recording = Recording([path])
+    playback = Playback(recording, other)
+    limits = {playback.robot.config.limits.angular_speed for _ in playback.steps()}
+    assert limits == {0.3}
+    assert len(playback.gaps) == 1
+
+
+def test_any_bytes_give_steps_or_an_error_in_words(long: Path, tmp_path: Path) -> None:
+    """Many bytes of a frame, of a head or of a whole file are forged."""
+    dice, path = random.Random(3), tmp_path / "forged"
+    for _ in range(20):
+        data = bytearray(long.read_bytes()[: dice.randrange(60_000)])
+        for _ in range(dice.randrange(1, 200)):
+            if data:
+                data[dice.randrange(len(data))] = dice.randrange(256)
+        path.write_bytes(data)
+        try:
+            played(path)
+        except RecordingError as error:
+            assert str(path.name) in str(error)  # noqa: PT017 - either result is right
