@@ -60,21 +60,6 @@ def test_the_newest_recording_is_exported_to_a_named_file_in_the_working_directo
     assert [path.name for path in here.iterdir()] == [name]
 
 
-@pytest.mark.slow
-def test_export_takes_a_number_and_a_name_and_overwrites_no_file(
-    where: Path, here: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert export(where, "7", "mine") == 0
-    before = (here / "mine").read_bytes()
-    assert export(where, "7", "mine") == 1
-    assert capsys.readouterr().err == (
-        "acsard: cannot write mine: this path exists already; --force overwrites it\n"
-    )
-    assert (here / "mine").read_bytes() == before
-    assert export(where, "7", "mine", "--csv", "--force") == 0
-    assert (here / "mine").read_bytes().startswith(b"t,")
-
-
 def test_a_range_of_time_exports_only_that_part(where: Path, here: Path) -> None:
     begin = datetime.fromtimestamp(START.wall_ns / 1e9 + 0.5).isoformat()
     assert export(where, "7", "a.csv", "--csv") == 0
