@@ -270,51 +270,6 @@ def test_an_environment_is_upgraded_to_by_its_directory(robot: Robot) -> None:
     assert robot.runs() == robot.old
 
 
-POSTINST = f"""\
-#!/bin/sh -e
-cd {VERSIONS}
-[ -e {{number}} ] || {{{{ cp -al dist/{{number}} .new && mv -T .new {{number}}; }}}}
-[ -e current ] || ln -s {{number}} current
-"""
-
-
-def package(robot: Robot, number: str) -> str:
-    """Make a Debian package with another version of acsard, and return its path."""
-    place, file = f"/srv/deb-{number}", f"/srv/acsard_{number}.deb"
-    robot.makes(number)
-    robot.container.types(
-        f"rm -rf {place} && mkdir -p {place}/DEBIAN {place}{VERSIONS}/dist && "
-        f"cp -r {VERSIONS}/{number} {place}{VERSIONS}/dist/ && rm -rf {VERSIONS}/{number}"
-    )
-    control = f"Package: acsard\nVersion: {number}-1\nArchitecture: all\n"
-    control += "Maintainer: acsard <acsard@localhost>\nDescription: acsard of a test\n"
-    robot.container.write(f"{place}/DEBIAN/control", control)
-    robot.container.write(f"{place}/DEBIAN/postinst", POSTINST.format(number=number), 0o755)
-    robot.container.types(f"dpkg-deb -Znone --build {place} {file} && rm -rf {place}")
-    return file
-
-
-@pytest.mark.nightly
-def test_a_package_is_upgraded_to_and_dpkg_alone_changes_nothing(robot: Robot) -> None:
-    first, second = package(robot, "9.2.0"), package(robot, "9.3.0")
-    try:
-        done = commanded(robot, "upgrade", first)
-        assert done.code == 0, done
-        assert robot.runs() == "9.2.0"
-        pid = robot.container.main_pid()
-        robot.container.types(f"dpkg -i {second}")
-        assert (robot.readlink(), robot.container.main_pid()) == ("9.2.0", pid)
-        assert "9.3.0 is installed, but not in use" in robot.types("service", "status").out
-        # dpkg has deleted its own copy of the version in use, and not that of the service.
-        robot.container.run("systemctl", "restart", UNIT)
-        assert robot.runs() == "9.2.0"
-        done = commanded(robot, "upgrade", f"{VERSIONS}/9.3.0")
-        assert done.code == 0, done
-        assert (robot.runs(), robot.readlink("previous")) == ("9.3.0", "9.2.0")
-    finally:
-        robot.container.run("dpkg", "--purge", "acsard")
-
-
 @pytest.mark.nightly
 @pytest.mark.timeout(3600)
 def test_an_upgrade_that_is_killed_at_any_moment_leaves_a_version_that_starts(
@@ -366,7 +321,7 @@ def test_with_a_full_disk_the_old_version_runs_on_and_no_part_of_the_new_one_sta
     robot: Robot,
 ) -> None:
     container = robot.container
-    place, file = environment(robot, "9.1.0"), package(robot, "9.2.0")
+    place = environment(robot, "9.1.0")
     container.run("systemctl", "stop", UNIT)
     try:
         container.types(
@@ -378,13 +333,11 @@ def test_with_a_full_disk_the_old_version_runs_on_and_no_part_of_the_new_one_sta
         container.types(f"mount -o remount,size={used + 40}m /opt")
         until(robot.link, 10.0, "the link is up")
         pid, before = container.main_pid(), container.types(f"ls -A {VERSIONS}").out
-        for new in (place, file):
-            done = commanded(robot, "upgrade", new)
-            assert (done.code, "No space left on device" in done.out + done.err) == (1, True), done
-            assert container.main_pid() == pid
-            assert robot.link()
-            robot.container.run("dpkg", "--purge", "acsard")
-            assert container.types(f"ls -A {VERSIONS}").out == before
+        done = commanded(robot, "upgrade", place)
+        assert (done.code, "No space left on device" in done.out + done.err) == (1, True), done
+        assert container.main_pid() == pid
+        assert robot.link()
+        assert container.types(f"ls -A {VERSIONS}").out == before
     finally:
         container.run("systemctl", "stop", UNIT)
         container.run("umount", "/opt")
