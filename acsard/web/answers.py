@@ -66,16 +66,27 @@ def problem(status: int, text: str, detail: str = "") -> web.Response:
 
 def file_answer(request: web.Request, file: File) -> web.Response:
     """Return a file, as gzip if the client takes it, or 304 if it has this version."""
-    headers = {"ETag": file.tag, "Cache-Control": "no-cache", "Vary": "Accept-Encoding"}
-    # An answer with the status 304 contains the policy too, because the browser uses it in place of
-    # the policy that it has stored with the file.
-    headers["Content-Security-Policy"] = _policy(request, file.policy)
+    headers = file_headers(request, file.tag, file.policy)
     if request.headers.get("If-None-Match") == file.tag:
         return web.Response(status=304, headers=headers)
     body = file.body
     if file.packed is not None and "gzip" in request.headers.get("Accept-Encoding", ""):
         body, headers["Content-Encoding"] = file.packed, "gzip"
     return web.Response(body=body, headers=headers | {"Content-Type": file.kind})
+
+
+def file_headers(request: web.Request, tag: str, policy: str) -> dict[str, str]:
+    """Return the headers of a file with this version, also of an answer with the status 304.
+
+    Such an answer contains the policy too, because the browser uses it in place of the policy that
+    it has stored with the file. `policy` is appended to that of all answers.
+    """
+    return {
+        "ETag": tag,
+        "Cache-Control": "no-cache",
+        "Vary": "Accept-Encoding",
+        "Content-Security-Policy": _policy(request, policy),
+    }
 
 
 def cut(transport: asyncio.BaseTransport | None) -> None:

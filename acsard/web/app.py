@@ -33,6 +33,7 @@ from acsard.web.answers import TroubleError, file_answer, page_files, reply
 from acsard.web.callers import PROTOCOL, RequestRefusedError, cookie_name, tokens_offered
 from acsard.web.camera import Camera
 from acsard.web.connections import Connections
+from acsard.web.manual import Manual
 from acsard.web.recordings import BlackBox, Recording
 from acsard.web.routes import JSON, RECORDINGS_ROLE, Body, Problem, Route, services, values
 from acsard.web.streams import as_json
@@ -89,7 +90,7 @@ class Page:
         rules: WebConfig,
     ) -> None:
         self._parts, self._tokens, self._connections = parts, tokens, connections
-        self._robot, self._files = parts.robot, page_files()
+        self._robot, self._files, self._manual = parts.robot, page_files(), Manual()
         self._box = BlackBox(parts.robot)
         self._camera = Camera(rules.camera)
         self._has_camera = bool(rules.camera)
@@ -126,6 +127,12 @@ class Page:
         if file is None:
             raise web.HTTPNotFound
         return file_answer(request, file)
+
+    async def manual_place(self, request: web.Request) -> web.StreamResponse:
+        raise web.HTTPFound("/docs/")  # the links of a page are relative to its directory
+
+    async def manual(self, request: web.Request) -> web.StreamResponse:
+        return await self._manual.answer(request, request.match_info["file"])
 
     async def token(self, request: web.Request) -> web.StreamResponse:
         """Return the token of the body in a cookie that no script can read.
@@ -317,6 +324,8 @@ ROUTES: tuple[Route, ...] = (
     Route("GET", "/", None, Page.index),
     Route("GET", "/favicon.ico", None, Page.icon),
     Route("GET", "/page/{name}", None, Page.file),
+    Route("GET", "/docs", None, Page.manual_place),
+    Route("GET", "/docs/{file}", None, Page.manual),
     Route("POST", "/token", None, Page.token,
         "exchanges a token for a cookie that no script can read; only over HTTPS",
         takes=TokenForm,

@@ -32,7 +32,7 @@ RECORDINGS_ROLE: Role = "operator"
 JSON = "application/json"
 
 # A path parameter with another name matches any text without a slash.
-PARAMETERS = {"type": "[A-Za-z0-9_]{1,80}", "verb": SERVICE_NAME.pattern}
+PARAMETERS = {"type": "[A-Za-z0-9_]{1,80}", "verb": SERVICE_NAME.pattern, "file": ".*"}
 
 _PARAMETER = re.compile(r"{(\w+)}")
 

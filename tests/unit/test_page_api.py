@@ -80,9 +80,11 @@ def test_the_socket_accepts_exactly_the_messages_that_its_schema_allows(message:
     assert Draft202012Validator(schema).is_valid(json.loads(message)) == valid
 
 
-def test_only_the_page_s_own_files_and_the_token_are_open_to_strangers() -> None:
+def test_only_the_files_of_page_and_manual_and_the_token_are_open_to_strangers() -> None:
     is_open = {row.path for row in ROUTES if row.least is None}
-    assert is_open == {"/", "/favicon.ico", "/page/{name}", "/token"}
+    assert is_open == {
+        "/", "/favicon.ico", "/page/{name}", "/docs", "/docs/{file}", "/token",
+    }  # fmt: skip
 
 
 def test_only_a_stop_is_served_beyond_the_limits_of_a_token() -> None:

@@ -1,0 +1,54 @@
+"""The built manual in a real browser, from the page's server and from no other one."""
+
+from __future__ import annotations
+
+import asyncio
+from pathlib import Path
+
+import pytest
+
+from acsard.web.manual import Manual
+from deploy.manual.build import build
+from tests.system.chromium import CHROMIUM, DESKTOP, browsing
+from tests.system.harness import until
+from tests.unit.test_page_whole import Whole
+
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.skipif(CHROMIUM is None, reason="needs chromium-headless-shell"),
+]
+
+FOUND = """[...document.querySelectorAll('*')].filter(one => one.shadowRoot)
+    .flatMap(one => [...one.shadowRoot.querySelectorAll('a')].map(one => one.href))"""
+"""The links of what the search has found."""
+
+LOADED = "performance.getEntriesByType('resource').map(one => one.name)"
+
+
+async def test_the_page_leads_to_the_manual_whose_links_and_search_work(tmp_path: Path) -> None:
+    archive = tmp_path / "manual.zip"
+    await asyncio.to_thread(build, archive)
+    whole = Whole(tmp_path)
+    whole.page._manual = Manual(archive)
+
+    def look(page: str) -> None:
+        with browsing() as browser:
+            browser.size(*DESKTOP, touch=False)
+            browser.open(page)
+            link = browser.js("document.getElementById('manual').href")
+            assert link == f"{page}docs/"
+            browser.said.clear()
+            browser.open(link)
+            browser.js("document.querySelector('article a[href$=\".html\"]').click()")
+            until(lambda: browser.js("location.pathname").endswith(".html"), 10.0, "a page")
+            until(lambda: browser.js("document.readyState") == "complete", 10.0, "all of it")
+            browser.js("document.querySelector('.md-search__button').click()")
+            browser.ask("Input.insertText", text="wheel_radius")
+            until(lambda: any("settings.html" in at for at in browser.js(FOUND)), 10.0, "it finds")
+            loaded = browser.js(LOADED)
+            assert loaded
+            assert [name for name in loaded if not name.startswith(link)] == []
+            assert browser.said == []
+
+    async with whole.served() as (url, _):
+        await asyncio.to_thread(look, f"{url}/")
