@@ -55,21 +55,6 @@ def test_no_line_of_a_robot_that_answers_at_uneven_times_is_dropped(counts: int)
     assert world.state.encoder_counts == [0] * 4
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("configured", [True, False])
-@pytest.mark.parametrize("counts", [16, 20])
-def test_a_robot_whose_wheels_respond_late_brakes_without_a_fault(
-    counts: int, configured: bool
-) -> None:
-    sim = SimConfig(encoder_counts=counts, motor_time_constant=0.2)
-    world = World(Config(sim=sim, mcu=McuConfig(encoder_counts=counts * configured)))
-    world.run(0.5)
-    for at in range(3):
-        world.drive(1.0, seconds=1.5 + 0.017 * at)
-        world.hold(0.0, 0.0, 1.5)
-    assert world.state.mode == "driving"
-
-
 @pytest.mark.parametrize("configured", [True, False])
 def test_counts_are_not_counted_twice_in_lines_that_are_faster_than_the_firmware_counts(
     configured: bool,

@@ -2,18 +2,12 @@
 
 from __future__ import annotations
 
-import itertools
-import math
 from itertools import product
 
 import pytest
 
-from acsard.core.config.contradictions import contradictions
 from acsard.core.config.settings import (
     Config,
-    ControlConfig,
-    FeedbackConfig,
-    LimitsConfig,
     McuConfig,
     SimConfig,
 )
@@ -25,7 +19,7 @@ from acsard.core.motion.wheels import (
     count_angle,
 )
 from acsard.core.simulator.faults import Fault
-from acsard.core.values import NS_PER_S, WHEELS, Received
+from acsard.core.values import NS_PER_S, WHEELS
 from tests.scenarios.world import World
 
 
@@ -71,103 +65,6 @@ def test_repeated_impossible_lines_are_a_fault_within_thirty_milliseconds(world:
         world.run(1.0)
     assert stopped(world)
     assert world.state.x == pytest.approx(x, abs=0.2)
-
-
-@pytest.mark.parametrize(
-    ("counts", "known", "rate", "bound"),
-    [
-        (16, False, 100.0, 5.0),
-        (96, False, 100.0, 5.0),
-        (400, False, 300.0, 4.5),
-        (96, True, 100.0, 5.0),
-    ],
-)
-def test_one_count_is_no_impossible_speed_although_it_looks_faster_than_the_bound(
-    counts: int, known: bool, rate: float, bound: float
-) -> None:
-    """At 100 Hz and 96 counts per turn, one count in a line looks like 6.5 rad/s.
-
-    The daemon must not treat that as an impossible speed.
-    """
-    world = World(
-        Config(
-            mcu=McuConfig(encoder_counts=counts if known else 0),
-            control=ControlConfig(rate=rate),
-            limits=LimitsConfig(linear_speed=0.2, angular_speed=1.0, wheel_speed=4.0),
-            feedback=FeedbackConfig(wheel_speed=bound),
-            sim=SimConfig(encoder_counts=counts),
-        )
-    )
-    assert contradictions(world.config) == []
-    world.run(1.0)
-    for speed in (0.2, -0.2, 0.2):
-        world.drive(speed, seconds=2.0)
-        assert (world.state.mode, event_texts(world, "fault")) == ("driving", [])
-        world.send(0.0)
-        world.run(0.5)
-    assert world.state.counters.get("line_implausible", 0) <= 10
-
-
-# damage
-
-
-def damage(world: World, silence: float, number: int, place: int, bits: int) -> None:
-    """Lose all replies for `silence` seconds, and damage one later reply.
-
-    Args:
-        world: The robot with its board.
-        silence: The time in which all replies are lost, s.
-        number: The number of the damaged reply after the silence, from 1.
-        place: The index of the damaged byte.
-        bits: A mask of the bits to invert.
-    """
-    feed, begun_ns, replies = world.port.feed, world.now_ns, itertools.count(1)
-
-    def through_the_wire(received: Received) -> None:
-        if received.at.mono_ns < begun_ns + silence * NS_PER_S:
-            return
-        data = bytearray(received.data)
-        if next(replies) == number:
-            data[place] ^= bits
-        feed(Received(received.at, bytes(data)))
-
-    world.port.feed = through_the_wire  # type: ignore[method-assign]
-
-
-def off_by(world: World) -> tuple[float, float]:
-    """Return the error of the pose in m and in rad."""
-    pose, true = world.state, world.mcu.vehicle.pose
-    turned = math.remainder(pose.yaw - true.yaw, math.tau)
-    return math.dist((pose.x, pose.y), (true.x, true.y)), abs(turned)
-
-
-TENS, ONES = (2, 10, 18, 26), (3, 11, 19, 27)
-"""Places of the tens and of the ones digits of the four speeds in a reply."""
-
-FLIPS = [(TENS[0], 8), (TENS[1], 1), (ONES[2], 8), (ONES[3], 2)]
-
-
-@pytest.mark.variations(6)
-@pytest.mark.parametrize("drives", [False, True])
-@pytest.mark.parametrize("silence", [0.06, 0.2, 0.3, 0.6, 0.9])
-def test_a_bit_flipped_in_the_first_line_after_a_silence_is_in_the_covariance(
-    drives: bool, silence: float
-) -> None:
-    for place, bits in [(0, 0), *FLIPS]:
-        world = World()
-        world.run(1.0)
-        if drives:
-            world.drive(0.5, 0.8, seconds=1.0)
-        damage(world, silence, 1, place, bits)
-        for _ in range(20):
-            if drives:
-                world.send(0.5, 0.8)
-            world.run(0.1)
-        assert event_texts(world, "fault") == []
-        metres, turned = off_by(world)
-        p = world.odom.pose.covariance
-        assert metres < max(0.03, 3.0 * math.sqrt(p[0] + p[7]))
-        assert turned < max(0.06, 3.0 * math.sqrt(p[35]))
 
 
 # hands

@@ -15,13 +15,11 @@ from acsard.core.config.settings import (
     OdometryConfig,
     SimConfig,
 )
-from acsard.core.link.feedback import Feedback
 from acsard.core.messages.schema import DiagnosticArray, DiagnosticStatus
 from acsard.core.simulator.faults import Fault
-from acsard.core.values import WHEELS, Estimate, Event, Instant
+from acsard.core.values import WHEELS
 from tests.scenarios.imperfect_gyro import ImperfectGyro
 from tests.scenarios.world import World
-from tests.unit.odometer import Plain
 
 COUNTS = SimConfig().encoder_counts
 
@@ -130,46 +128,6 @@ def test_with_a_gyro_and_a_wheel_fault_heading_and_distance_stay_right() -> None
     distance, turn = off(made)
     assert distance < 0.2
     assert turn < 0.1
-
-
-def reversed_encoder(seed: int) -> tuple[float, float, str]:
-    """Drive a robot with 96 counts per turn at random, with one reversed encoder, until a fault.
-
-    The motors may respond faster or slower than configured, and the robot may creep. Returns the
-    final heading error of the odometry and that of a plain mean of the wheels (both in rad), and
-    the reason of the fault, or "" if it does not name the wheel.
-    """
-    dice, plain = random.Random(seed), Plain()
-    lag, scale = dice.choice((0.05, 0.2, 0.6)), dice.choice((0.25, 1.0))
-    sim = SimConfig(encoder_counts=96, motor_time_constant=lag)
-    made, wheel = world(sim=sim, counts=96), dice.randrange(4)
-    integrate = made.loop.robot._check_and_integrate
-
-    def both(line: Feedback, now: Instant, events: list[Event]) -> Estimate:
-        plain.fold(line)
-        return integrate(line, now, events)
-
-    setattr(made.loop.robot, "_check_and_integrate", both)  # noqa: B010
-    made.drive(scale * dice.uniform(-0.6, 1), scale * dice.uniform(-2, 2), dice.uniform(0.5, 1.5))
-    with encoder_fault(made, "reversed", wheel):
-        for _ in range(6):
-            twist = scale * dice.uniform(-0.6, 1.0), scale * dice.uniform(-2, 2)
-            made.hold(*twist, dice.uniform(0.5, 2.0))
-            if made.state.mode == "fault":
-                break
-        reason = made.state.reason if WHEELS[wheel] in made.state.reason else ""
-        made.run(1.5)
-    by_plain = math.remainder(plain.pose.yaw - made.mcu.vehicle.pose.yaw, math.tau)
-    return off(made)[1], abs(by_plain), reason
-
-
-@pytest.mark.slow
-def test_forty_robots_of_96_counts_with_a_reversed_encoder_are_all_found() -> None:
-    results = [reversed_encoder(seed) for seed in range(40)]
-    remainder, phantom = sum(result[0] for result in results), sum(result[1] for result in results)
-    print(f"\n{remainder / phantom:.1%} of the phantom of {phantom:.1f} rad is kept")
-    assert [seed for seed, (_, _, reason) in enumerate(results) if not reason] == []
-    assert remainder < 0.05 * phantom
 
 
 @pytest.mark.slow
