@@ -14,7 +14,9 @@ RECORDED = ROOT / "tests" / "recordings" / "quiet.rec.zst"
 
 def test_an_export_to_a_full_disk_ends_with_one_sentence_and_leaves_no_file(tmp_path: Path) -> None:
     words = acsard("recording", "export", str(RECORDED), "new.mcap")
-    full = ["sh", "-c", 'ulimit -f 16; exec "$@"', "sh", *words]  # blocks of 512 bytes per file
+    # Blocks of 512 bytes per file. Python would write the beginning of its bytecode, too.
+    limit = 'ulimit -f 16; export PYTHONDONTWRITEBYTECODE=1; exec "$@"'
+    full = ["sh", "-c", limit, "sh", *words]
     ended = finish(full, tmp_path)
     assert (ended.code, ended.err) == (1, "acsard: cannot write new.mcap: File too large")
     assert not [*tmp_path.iterdir()]

@@ -5,9 +5,12 @@ from __future__ import annotations
 import os
 import pty
 import re
+import select
+import termios
 import threading
-import time
+from collections import deque
 from collections.abc import Callable, Iterator
+from typing import TextIO
 
 import pytest
 
@@ -15,55 +18,62 @@ from acsard.checkup.findings import Finding
 from acsard.host.terminal_modes import single_key_mode
 from acsard.terminal.output import plain
 from acsard.terminal.prompt import NobodyError, NumberQuestion, Prompt, TerminalPrompt, row
+from tests.system.harness import until
 
 DISTANCE = NumberQuestion("How far?", "m", 0.5, 3.0)
 OPTIONAL = NumberQuestion("How far, if you like?", "m", 0.0, 3.0, 0.0)
 
-Types = Callable[[str], None]
-
 pytestmark = pytest.mark.timeout(30)
 
 
+class Terminal:
+    """The terminal that is standard input, with a person who types when it is read."""
+
+    def __init__(self, master: int, terminal: TextIO) -> None:
+        self._master, self._terminal = master, terminal
+        self._texts, self._read = deque[str](), os.read
+
+    def types(self, text: str) -> None:
+        os.write(self._master, text.encode())
+        until(lambda: select.select([self._terminal], [], [], 0)[0], 10.0, "it arrives")
+
+    def answers(self, *texts: str) -> None:
+        """Type one of these texts before each read from now on."""
+        self._texts.extend(texts)
+
+    def read(self, fd: int, size: int) -> bytes:
+        if fd == self._terminal.fileno() and self._texts:
+            self.types(self._texts.popleft())
+        return self._read(fd, size)
+
+
 @pytest.fixture
-def types(monkeypatch: pytest.MonkeyPatch) -> Iterator[Types]:
-    """Return a function that types a text on the terminal that is standard input.
-
-    It types after a delay because the prompt discards everything that was typed before the question
-    appeared.
-    """
+def terminal(monkeypatch: pytest.MonkeyPatch) -> Iterator[Terminal]:
     master, slave = pty.openpty()
-    hands: list[threading.Timer] = []
-
-    def types(text: str) -> None:
-        hands.append(threading.Timer(0.1 * (len(hands) + 1), os.write, [master, text.encode()]))
-        hands[-1].start()
-
-    with open(slave) as terminal:
-        monkeypatch.setattr("sys.stdin", terminal)
-        yield types
-    for hand in hands:
-        hand.join()
+    with open(slave) as stream:
+        terminal = Terminal(master, stream)
+        monkeypatch.setattr("sys.stdin", stream)
+        monkeypatch.setattr(os, "read", terminal.read)
+        yield terminal
     os.close(master)
 
 
 def test_a_number_is_asked_for_until_it_is_valid_and_within_its_bounds(
-    types: Types, capsys: pytest.CaptureFixture[str]
+    terminal: Terminal, capsys: pytest.CaptureFixture[str]
 ) -> None:
+    terminal.answers("far\n", "0.1\n", "-2\n", "\n", "1,75\n")
     with single_key_mode():
-        person = TerminalPrompt()
-        for line in ("far\n", "0.1\n", "-2\n", "\n", "1,75\n"):
-            types(line)
-        assert person.number(DISTANCE) == 1.75
+        assert TerminalPrompt().number(DISTANCE) == 1.75
     assert capsys.readouterr().err.count("from 0.5 to 3") == 4
 
 
 @pytest.mark.parametrize("asked", [lambda p: p.number(DISTANCE), lambda p: p.start("Go.")])
-def test_q_quits_at_every_question(types: Types, asked: Callable[[TerminalPrompt], object]) -> None:
-    with single_key_mode():
-        person = TerminalPrompt()
-        types("q\n")
-        with pytest.raises(KeyboardInterrupt):
-            asked(person)
+def test_q_quits_at_every_question(
+    terminal: Terminal, asked: Callable[[TerminalPrompt], object]
+) -> None:
+    terminal.answers("q\n")
+    with single_key_mode(), pytest.raises(KeyboardInterrupt):
+        asked(TerminalPrompt())
 
 
 @pytest.mark.parametrize(
@@ -91,20 +101,26 @@ def test_a_terminal_that_closes_ends_the_question_without_another_error(
     hand.join()
 
 
-def test_a_line_that_was_typed_before_the_question_does_not_answer_it(types: Types) -> None:
-    types("fl\n")
-    time.sleep(0.4)
-    types("rr\n")
+def test_a_line_that_was_typed_before_the_question_does_not_answer_it(
+    terminal: Terminal, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    flush = termios.tcflush
+
+    def flushed(stream: TextIO, queue: int) -> None:
+        flush(stream, queue)
+        terminal.types("rr\n")
+
+    terminal.types("fl\n")
+    monkeypatch.setattr(termios, "tcflush", flushed)
     assert TerminalPrompt().ask("Which wheel did motor b turn?", ("fl", "rr")) == "rr"
 
 
-def test_nothing_but_enter_starts_a_leg(types: Types) -> None:
+def test_nothing_but_enter_starts_a_leg(terminal: Terminal) -> None:
+    terminal.answers("x ", "\n")
     with single_key_mode():
         person = TerminalPrompt()
-        types("x ")
-        types("\n")
-        types(" ")
         person.start("Go.")
+        terminal.types(" ")
         assert person.keys(5.0) == " "
 
 
