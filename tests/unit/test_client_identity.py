@@ -6,7 +6,6 @@ import os
 import subprocess
 import sys
 import tempfile
-import traceback
 from collections.abc import Iterator
 from itertools import permutations
 from pathlib import Path
@@ -118,12 +117,3 @@ def test_a_directory_without_certificates_is_reported_and_not_taken_for_a_missin
     ):
         pass
     assert isinstance(error.value, ValueError)
-
-
-def test_a_missing_daemon_is_reported_without_the_errors_of_zenoh() -> None:
-    with pytest.raises(client.UnreachableError) as raised, client.connect("tcp/127.0.0.1:1"):
-        pass
-    trace = "".join(traceback.format_exception(raised.value))
-    assert "no daemon answers at tcp/127.0.0.1:1" in trace
-    assert "ZError" not in trace
-    assert ".rs" not in trace

@@ -16,7 +16,7 @@ from acsard.core.config.settings import Config, RecordConfig
 from acsard.core.incoming.commands import Arrival
 from acsard.core.link.serial_output import Offered
 from acsard.core.robot import Robot
-from acsard.core.values import NS_PER_S, Cause, Event, Heard, Instant, Latches, News
+from acsard.core.values import NS_PER_S, Event, Heard, Instant, Latches, News
 from acsard.recording import recorder as module
 from acsard.recording.file import Failure, Head, Recording, Waits, listed
 from acsard.recording.recorder import Recorder
@@ -26,7 +26,6 @@ from tests.unit.drives import drive
 
 SECRET = "PRIVATE KEY of a robot"
 BUG = "a part that is never zero"
-STOP = Cause(5, "stop", "stopped", "stopped by ann", by="ann", at_ns=START.wall_ns, kept=True)
 
 
 class Bench:
@@ -54,12 +53,12 @@ class Bench:
 
 
 @pytest.fixture
-def new(request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Bench:
-    """Return a bench before its first step, with the parameter as kept latches."""
+def new(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Bench:
+    """Return a bench before its first step."""
     monkeypatch.setattr(module, "WRITE_PAUSE_S", 1000.0)
     monkeypatch.setattr(module, "CLOSE_S", 20.0)
     config = replace(Config(), record=RecordConfig(str(tmp_path), 10.0))
-    return Bench(config, Latches(getattr(request, "param", ()), 5))
+    return Bench(config, Latches((), 5))
 
 
 @pytest.fixture
@@ -82,21 +81,6 @@ def played(paths: list[Path]) -> Playback:
 
 def heads_of(paths: list[Path]) -> list[Head]:
     return [record for record in Recording(paths).records() if isinstance(record, Head)]
-
-
-@pytest.mark.parametrize("new", [(), (STOP,)], ids=["new", "with a kept latch"], indirect=True)
-def test_a_recorded_drive_replays_bit_by_bit(bench: Bench) -> None:
-    if bench.world.state.mode == "stopped":
-        assert bench.world.call("clear").success
-        bench.world.drive(0.5, 0.2, seconds=1.0)
-    bench.drive(2)
-    assert bench.world.state.mode == "driving"
-    paths = bench.end()
-    playback = played(paths)
-    assert (len(paths), playback.gaps) == (1, [])
-    assert playback.comparison.steps == bench.world.steps
-    assert [event.text for event in bench.said] == [f"the daemon records to {bench.where}"]
-    assert bench.recorder.status.missing == 0
 
 
 def test_heads_and_files_begin_after_their_times_and_each_file_replays_alone(

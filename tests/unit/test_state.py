@@ -11,7 +11,6 @@ import pytest
 from msgspec.structs import replace
 
 from acsard.core.config.settings import Config, LimitsConfig
-from acsard.core.motion.arbiter_text import MAX_SENDER_LENGTH
 from acsard.core.motion.modes import REFUSALS, Mode, RefusedError, mode_of, require_allowed
 from acsard.core.values import (
     REST,
@@ -204,15 +203,6 @@ def test_a_service_that_is_called_continuously_causes_one_event_per_second() -> 
     rig = Rig().linked()
     events = [event for out in rig.each(250, ask="reset_odometry") for event in out.events]
     assert [event.count for event in events] == [1, 100, 100]
-
-
-def test_a_refused_command_is_reported_with_its_reason_and_its_sender() -> None:
-    (event,) = Rig().linked().step(REST, source="nobody").events
-    assert (event.name, event.level, event.code) == ("command_refused", "warning", "unknown_source")
-    refusal = Refusal("malformed", "cmd/app: no map", "app", "a" * 1000)
-    events = [e for out in Rig().linked().each(150, refusals=(refusal,)) for e in out.events]
-    assert [event.count for event in events] == [1, 100]
-    assert {(e.code, e.by) for e in events} == {("malformed", "a" * MAX_SENDER_LENGTH)}
 
 
 def test_a_speed_limit_applies_until_it_ends_and_each_change_is_an_event() -> None:
