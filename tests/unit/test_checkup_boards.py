@@ -164,9 +164,12 @@ def lines(finding: Finding) -> Iterator[str]:
         yield f"        -> {finding.mend}"
 
 
+DAILY = ("good", "motors", "hardware")
+
+
 @pytest.mark.parametrize(
     "page",
-    [pytest.param(page, marks=() if page == "good" else pytest.mark.slow) for page in BOARDS],
+    [pytest.param(page, marks=() if page in DAILY else pytest.mark.slow) for page in BOARDS],
 )
 def test_the_check_names_each_fault_and_nothing_else(
     page: str, approved: Callable[[Path, str], None]
