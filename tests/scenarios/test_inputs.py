@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import math
+
 import msgspec
 import pytest
 
 from tests.each import each
 from tests.scenarios.speakers import Speaker
 from tests.scenarios.world import World
+
+NAN = msgspec.msgpack.encode({"linear": {"x": math.nan}, "angular": {}})
 
 
 @pytest.fixture
@@ -17,44 +21,26 @@ def world() -> World:
     return world
 
 
-@pytest.mark.slow
 @each(
-    ("key", "payload", "put", "reason"),
+    ("key", "payload", "reason"),
     [
-        ("cmd/app", b"{", True, "malformed"),
-        ("cmd/app", b"hello", True, "unknown_encoding"),
-        ("cmd/app", b"", True, "unknown_encoding"),
-        ("cmd/app", b'{"linear":{"x":0.5}}', True, "wrong_shape"),
-        ("cmd/app", b'{"linear":{"x":"fast"},"angular":{}}', True, "wrong_shape"),
-        ("cmd/app", b'{"linear":{"speed":1},"angular":{}}', True, "wrong_shape"),
-        ("cmd/app", b'{"linear":{},"angular":{}}' + b" " * 5000, True, "too_big"),
-        ("cmd/app", b'{"linear":{"x":0.5},"angular":{}}', False, "not_a_put"),
-        ("cmd/*", b'{"linear":{"x":0.5},"angular":{}}', True, "wildcard"),
-        ("**", b'{"linear":{"x":0.5},"angular":{}}', True, "wildcard"),
-        ("cmd/stranger", b'{"linear":{"x":0.5},"angular":{}}', True, "unknown_source"),
-        ("wheel_cmd/app", b'{"name":["a"],"velocity":[1]}', True, "wrong_wheels"),
+        ("cmd/app", b"{", "malformed"),
+        ("cmd/stranger", b'{"linear":{"x":0.5},"angular":{}}', "unknown_source"),
         (
             "cmd/app",
-            msgspec.msgpack.encode({"linear": {"x": float("nan")}, "angular": {}}),
-            True,
-            "not_finite",
-        ),
-        (
-            "cmd/app",
-            msgspec.msgpack.encode({"linear": {"y": float("inf")}, "angular": {}}),
-            True,
+            msgspec.msgpack.encode({"linear": {"x": math.nan}, "angular": {}}),
             "not_finite",
         ),
     ],
 )
 def test_a_bad_command_is_refused_as_a_whole_and_counted(
-    key: str, payload: bytes, put: bool, reason: str
+    key: str, payload: bytes, reason: str
 ) -> None:
     world = World()
     world.run(0.2)
     world.drive(0.3, seconds=0.5)
     world.run(0.2)
-    world.put(key, payload, put)
+    world.put(key, payload)
     world.run(0.06)
     assert world.state.counters[f"command_{reason}"] == 1
     assert world.state.refused

@@ -225,16 +225,6 @@ def test_damage_costs_one_frame(seed: int, long: Path, whole: list[int], tmp_pat
     judge(path, whole)
 
 
-def test_a_damaged_beginning_costs_the_first_frame(
-    long: Path, whole: list[int], tmp_path: Path
-) -> None:
-    data = bytearray(long.read_bytes())
-    data[:64] = bytes(64)
-    path = tmp_path / "damaged"
-    path.write_bytes(data)
-    judge(path, whole)
-
-
 def test_another_configuration_stays_in_force_after_damage(
     long: Path, whole: list[int], tmp_path: Path
 ) -> None:

@@ -24,14 +24,6 @@ def row(world: World, name: str) -> DiagnosticStatus:
     return row_status
 
 
-def test_a_stop_is_a_warning_until_it_is_cleared(world: World) -> None:
-    world.call("stop")
-    assert row(world, "mode").level == WARN
-    assert "srv/clear" in row(world, "mode").message
-    world.call("clear")
-    assert row(world, "mode").level == OK
-
-
 @pytest.mark.slow
 def test_a_source_is_a_warning_while_it_is_refused(world: World) -> None:
     world.drive(0.3, seconds=0.5)
@@ -43,13 +35,6 @@ def test_a_source_is_a_warning_while_it_is_refused(world: World) -> None:
     assert "source nobody: this source is not in commands.sources" in row(world, "commands").message
     world.hold(0.3, seconds=2.0)
     assert (row(world, "commands").level, world.state.source) == (OK, "app")
-
-
-def test_a_new_sender_with_another_clock_causes_no_warning(world: World) -> None:
-    client = Speaker(world, "signed", ahead=-3600.0)
-    client.hold(0.0, 0.2)
-    assert world.state.counters["commands_of_new_senders"] == 4
-    assert row(world, "commands").level == OK
 
 
 @pytest.mark.parametrize("way", ["client", "rmw"])
