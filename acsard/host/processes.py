@@ -35,8 +35,8 @@ class _Open(Struct, frozen=True):
     process: Path
     fd: str
 
-    def device(self) -> int:
-        return _number(self.process / "fd" / self.fd)
+    def device(self) -> tuple[int, int]:
+        return _device(self.process / "fd" / self.fd)
 
     def fdinfo(self) -> list[str]:
         return _text(self.process / "fdinfo" / self.fd).splitlines()
@@ -78,7 +78,9 @@ def masters_of(path: str) -> Iterator[Holder]:
     wanted = _number(path)
     index = f"tty-index:\t{os.minor(wanted) + 256 * (os.major(wanted) - PTY_MAJORS[0])}"
     for descriptor in _open_devices("/ptmx"):
-        if index in descriptor.fdinfo() and (holder := _holder(descriptor.process)) is not None:
+        if index not in descriptor.fdinfo() or not _shares_ptys(descriptor.process, path):
+            continue
+        if (holder := _holder(descriptor.process)) is not None:
             yield holder
 
 
@@ -130,10 +132,27 @@ def _open_devices(part: str) -> Iterator[_Open]:
 
 
 def _having_open(path: str) -> Iterator[_Open]:
-    wanted = _number(path)
-    for descriptor in _open_devices("") if wanted else ():
+    wanted = _device(path)
+    for descriptor in _open_devices("") if any(wanted) else ():
         if descriptor.device() == wanted:
             yield descriptor
+
+
+def _shares_ptys(process: Path, path: str) -> bool:
+    try:
+        return os.stat(process / "root/dev/pts").st_dev == os.stat(path).st_dev
+    except OSError:
+        return True  # of another user, so it cannot be known
+
+
+# Each container has ptys of its own, with the same numbers, on a file system of their own.
+def _device(path: str | Path) -> tuple[int, int]:
+    try:
+        status = os.stat(path)
+    except OSError:
+        return 0, 0
+    number = status.st_rdev
+    return number, status.st_dev if os.major(number) in PTY_MAJORS else 0
 
 
 def _number(path: str | Path) -> int:
