@@ -5,13 +5,12 @@ from __future__ import annotations
 import os
 import pty
 import signal
-import subprocess
 import tomllib
 from pathlib import Path
 
 import pytest
 
-from tests.system.harness import Bus, Daemon, Program, acsard, until
+from tests.system.harness import Bus, Daemon, FarPeer, Program, acsard, until
 from tests.system.terminals import Terminal, at_terminal
 from tests.system.typed import typed
 
@@ -106,6 +105,7 @@ def test_ctrl_c_at_the_first_question_ends_mcu_check_with_130(tmp_path: Path) ->
 
 
 @pytest.mark.slow
+@pytest.mark.nightly
 def test_q_without_enter_ends_mcu_check_while_a_motor_turns(tmp_path: Path) -> None:
     with Program(acsard("sim"), tmp_path) as sim:
         port = sim.says("acsard run --port").split()[-1]
@@ -125,22 +125,20 @@ def test_q_without_enter_ends_mcu_check_while_a_motor_turns(tmp_path: Path) -> N
     "number", [pytest.param(signal.SIGTERM, marks=pytest.mark.nightly), signal.SIGINT]
 )
 def test_a_signal_while_a_wheel_turns_ends_in_zeros(tmp_path: Path, number: signal.Signals) -> None:
-    with Program(acsard("sim", "--fault", "no_watchdog"), tmp_path) as sim:
-        port = sim.says("acsard run --port").split()[-1]
-        words = acsard("mcu", "check", "--port", port, "--yes")
-        with Program(words, tmp_path) as check:
-            check.says("checked link")
-            # The check prints nothing from now on while motor a turns.
-            with pytest.raises(subprocess.TimeoutExpired):
-                check.process.wait(0.5)
-            check.signal(number)
-            assert check.ended(5.0) == (130 if number == signal.SIGINT else 128 + number)
-            assert "sends zero speeds" in check.stderr
-            assert "Traceback" not in check.stderr
-        # The next check finds the wheels at rest, and the port free.
-        words = acsard("mcu", "check", "--port", port, "--yes")
-        with Program(words, tmp_path) as again:
-            again.says("PASS    motor a", 30.0)
+    zeros, words = b"ap00.00,bp00.00,cp00.00,dp00.00", ("--yes", "--wheels-are-lifted")
+    with FarPeer(tmp_path) as peer:
+
+        def turns() -> bool:
+            return any(line[:1] == b"a" and line[1:7] != b"p00.00" for _, line in peer.lines[-20:])
+
+        check = acsard("mcu", "check", "--port", str(peer.path), *words)
+        with Program(check, tmp_path) as program:
+            until(turns, 60.0, f"motor a turns\n{program}")
+            program.signal(number)
+            assert program.ended(5.0) == (130 if number == signal.SIGINT else 128 + number)
+        assert "sends zero speeds" in program.stderr
+        assert "Traceback" not in program.stderr
+        assert peer.lines[-1].line[:31] == zeros
 
 
 @pytest.mark.network
