@@ -258,6 +258,7 @@ def test_a_daemon_in_a_terminal_serves_its_page_at_a_free_port_and_restarts_it(
 
 
 @pytest.mark.slow
+@pytest.mark.nightly
 def test_the_page_starts_answers_and_stays_alive_while_nobody_reads_the_terminal(
     tmp_path: Path,
 ) -> None:
