@@ -18,8 +18,9 @@ pytestmark = [
     pytest.mark.skipif(CHROMIUM is None, reason="needs chromium-headless-shell"),
 ]
 
-FOUND = """[...document.querySelectorAll('*')].filter(one => one.shadowRoot)
-    .flatMap(one => [...one.shadowRoot.querySelectorAll('a')].map(one => one.href))"""
+SEARCH = "[...document.querySelectorAll('*')].find(one => one.shadowRoot)?.shadowRoot"
+TYPES = f"{SEARCH}?.activeElement?.tagName === 'INPUT'"
+FOUND = f"[...{SEARCH}.querySelectorAll('a')].map(one => one.href)"
 """The links of what the search has found."""
 
 LOADED = "performance.getEntriesByType('resource').map(one => one.name)"
@@ -43,6 +44,7 @@ async def test_the_page_leads_to_the_manual_whose_links_and_search_work(tmp_path
             until(lambda: browser.js("location.pathname").endswith(".html"), 10.0, "a page")
             until(lambda: browser.js("document.readyState") == "complete", 10.0, "all of it")
             browser.js("document.querySelector('.md-search__button').click()")
+            until(lambda: browser.js(TYPES), 10.0, "it takes text")
             browser.ask("Input.insertText", text="wheel_radius")
             until(lambda: any("settings.html" in at for at in browser.js(FOUND)), 10.0, "it finds")
             loaded = browser.js(LOADED)
