@@ -59,6 +59,9 @@ SITUATIONS: dict[str, tuple[Config, dict[str, Any]]] = {
     "a fault of the driver": (CONFIG, {"mode": "fault", "code": "driver_fault"}),
     "a fault of acsard": (CONFIG, {"mode": "fault", "code": "guard_too_fast"}),
     **{f"a link that is {link}": (CONFIG, {"link": link}) for link in ("stale", "booting", "down")},
+    "a robot that waits for its link": (
+        CONFIG, {"mode": "waiting", "link": "down", "code": "port_trouble"},
+    ),
     "a late computer": (CONFIG, {"link": "stale", "code": "host_late"}),
     "the simulator": (Config(), {}),
     "the simulator without a link": (Config(), {"link": "down"}),

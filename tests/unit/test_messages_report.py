@@ -279,6 +279,16 @@ def test_the_current_value_is_that_of_the_last_step_even_without_subscribers(key
         assert report.current(other, never) is None
 
 
+def test_without_feedback_the_current_odometry_is_at_rest_with_unknown_variances() -> None:
+    report, blind = Report(CONFIG, START), replace(SNAPSHOT, measured=None, speeds=None)
+    due(report, OUTPUTS, set(), never)
+    odom: Any = report.current("odom", lambda: blind)
+    assert odom.twist.twist == Twist(Vector3(), Vector3())
+    assert odom.twist.covariance == [1e6 if cell % 7 == 0 else 0.0 for cell in range(36)]
+    wheels: Any = report.current("wheel_states", lambda: blind)
+    assert (wheels.position, wheels.velocity) == ([10.0, 20.0, 30.0, 40.0], [])
+
+
 # rates
 
 

@@ -314,8 +314,10 @@ def test_every_endpoint_with_a_single_type_has_its_own_token() -> None:
     assert [parts[5] for parts in tokens] == [
         kinds[e.direction] for e in all_endpoints(None, "rmw")
     ]
-    silent = {e.native for e in all_endpoints(None, "bridge") if not e.token}
+    bridge = all_endpoints(None, "bridge")
+    silent = {e.native for e in bridge if not e.token}
     assert silent == {"cmd/nav", "cmd/dock", "cmd/teleop"}
+    assert len({e.key for e in bridge}) == len(bridge)
 
 
 def test_what_a_robot_does_not_publish_or_use_has_no_endpoint() -> None:
