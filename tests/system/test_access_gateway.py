@@ -23,10 +23,8 @@ from acsard.host.errors import InUseError
 from acsard.machine.authority import Authority
 from tests.system.harness import (
     Bus,
-    Daemon,
     acsard,
     children,
-    finish,
     free_endpoint,
     until,
     write_config,
@@ -160,15 +158,6 @@ def test_a_stop_over_tls_that_waits_for_longer_than_two_seconds_stops_the_robot(
             until(lambda: other.state()["mode"] == "stopped", 5.0, "the stop arrives")
         if paused == "gateway":
             assert gateway_of(robot) == pid
-
-
-def test_without_a_tls_endpoint_there_is_no_gateway_to_open(tmp_path: Path) -> None:
-    config = write_config(tmp_path / "plain.toml", {"bus": {"listen": [free_endpoint()]}})
-    done = finish(acsard("gateway", "--config", str(config)), tmp_path)
-    assert done.code == 2
-    assert "no tls/ endpoint" in done.err
-    with Daemon(tmp_path) as daemon:
-        assert not children(daemon.pid, "acsard gateway")
 
 
 def gateway_with(own: Path, tls: str) -> Gateway:

@@ -6,9 +6,7 @@ and a few lines of code replace the storage plugin. `test_access.py` tries the p
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator
-from pathlib import Path
 
 import pytest
 import zenoh
@@ -16,12 +14,8 @@ import zenoh
 from acsard.client import connect
 from acsard.core.config.contradictions import warnings
 from acsard.core.config.parsing import parse
-from acsard.core.messages.json_schema import SCHEMAS
-from acsard.core.messages.keys_and_roles import SERVICES, TOPICS, WHOAMI, source_keys, whoami_key
-from acsard.core.values import ROLES
-from tests.permissions import FORGED, SOURCES, TWIST
-from tests.promised import PUBLISHED
-from tests.system.fleet_router import ROBOT_FILE, ROBOTS, Fleet, for_two
+from tests.permissions import FORGED, TWIST
+from tests.system.fleet_router import ROBOT_FILE, Fleet
 from tests.system.harness import Bus, until
 
 pytestmark = pytest.mark.network
@@ -108,55 +102,3 @@ def test_the_robot_configuration_of_the_manual_is_valid_without_warnings() -> No
     assert config.bus.mode == "client"
     router = config.bus.connect[0].removeprefix("tls/").partition(":")[0]
     assert config.access.maintainers == (router,)  # `tls add NAME` makes it valid for that name
-
-
-def test_the_router_names_the_keys_of_the_topic_table_and_the_default_sources(
-    tmp_path: Path,
-) -> None:
-    config = zenoh.Config.from_file(str(for_two(tmp_path)))
-    access = json.loads(config.get_json("access_control"))
-    keys = {rule["id"]: set(rule["key_exprs"]) for rule in access["rules"]}
-    published = {key for row in PUBLISHED for key in (row.key, f"json/{row.key}")}
-    assert keys["hear"] == {f"acsard/*/{key}" for key in published}
-    asked = {topic.key for topic in TOPICS if topic.direction == "query"}
-    asked -= {"schema/<Type>", WHOAMI}
-    asked |= {f"schema/{name}" for name in SCHEMAS} | {whoami_key("viewer")}
-    least: dict[str, str] = {role: whoami_key(role) for role in ROLES}
-    services = {f"srv/{verb}" for verb in SERVICES}
-    commands = set(source_keys(SOURCES, "operator"))
-    for robot in ROBOTS:
-        key_sets = {
-            kind: {key.removeprefix(f"acsard/{robot}/") for key in keys[f"{kind}-{robot}"]}
-            for kind in ("see", "stop", "operate", "slow", "keep", "sense")
-        }
-        key_sets["drive"] = {
-            key.removeprefix(f"acsard/{robot}/")
-            for key in keys["commands of operator"]
-            if key.startswith(f"acsard/{robot}/")
-        }
-        assert key_sets["see"] | key_sets["keep"] >= published | asked | {"alive"}
-        inputs = {"stop", "imu", "speed_limit"}
-        assert set().union(*key_sets.values()) == (
-            published | asked | services | commands | inputs | {"alive", *least.values()}
-        )
-        assert key_sets["drive"] == commands
-        for kind, role in (("see", "viewer"), ("operate", "operator"), ("keep", "maintainer")):
-            assert {key for key in key_sets[kind] if key.startswith("whoami/")} == {least[role]}
-        assert not key_sets["see"] & (commands | services - {"srv/stop"})
-
-
-def test_no_ingress_rule_of_the_router_for_a_person_has_a_wildcard(tmp_path: Path) -> None:
-    config = zenoh.Config.from_file(str(for_two(tmp_path)))
-    access = json.loads(config.get_json("access_control"))
-    rules = {rule["id"]: rule for rule in access["rules"]}
-    people = {"viewers", "operators", "maintainers"}
-    people |= {"certificate operator", "certificate maintainer"}
-    names = {
-        name
-        for policy in access["policies"]
-        if people & set(policy["subjects"])
-        for name in policy["rules"]
-    }
-    ingress = [rules[name] for name in names if "ingress" in rules[name]["flows"]]
-    assert ingress
-    assert not [key for rule in ingress for key in rule["key_exprs"] if "*" in key]

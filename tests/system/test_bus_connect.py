@@ -16,10 +16,7 @@ from tests.system.harness import (
     Bus,
     Daemon,
     Program,
-    Tables,
-    acsard,
     client_config,
-    finish,
     free_endpoint,
     twist,
     until,
@@ -87,36 +84,6 @@ def test_a_client_says_that_its_router_went_and_came_back(tmp_path: Path) -> Non
             wait_for_event(daemon, "router_found", 2)
             with Bus(meeting) as bus:
                 until(lambda: row(bus)["message"] == "connected", 2.0, "diagnostics say it")
-
-
-@pytest.mark.slow
-def test_two_directly_connected_daemons_report_it_and_a_wildcard_stop_reaches_one(
-    tmp_path: Path,
-) -> None:
-    """A daemon that is not a router forwards no messages between the others.
-
-    So a stop for all robots reaches only the daemon to which the operator is connected.
-    """
-    first = Daemon(tmp_path, config={"robot": {"id": "one"}}, name="one")
-    config: Tables = {
-        "robot": {"id": "two"},
-        "bus": {"connect": [first.endpoint]},
-        "ros": {"namespace": "two"},
-    }
-    with first, Daemon(tmp_path, config=config, name="two", endpoint=free_endpoint()) as two:
-        assert first.endpoint in wait_for_event(two, "not_a_router", 1)
-        with Bus(two.endpoint, robot_id="two") as bus:
-            until(lambda: "is not a router" in row(bus)["message"], 2.0, "diagnostics say it")
-        toml = f'[robot]\nid = "two"\n[bus]\nlisten = ["{two.endpoint}"]\n'
-        _, findings = examined(tmp_path, toml + f'connect = ["{first.endpoint}"]\n')
-        (mend,) = (each["mend"] for each in findings["router"] if "not a router" in each["text"])
-        assert "connect all robots to a Zenoh router" in mend
-        stopped = finish(acsard("call", "stop", "--id", "*", "--connect", first.endpoint), tmp_path)
-        assert stopped.out.startswith("one: stopped")
-        assert f"all robots visible at {first.endpoint}: 1 robot" in stopped.err
-        assert first.events("not_a_router") == []  # `first` has no router to connect to
-        with Bus(two.endpoint, robot_id="two") as bus:
-            assert bus.state()["mode"] != "stopped"
 
 
 @pytest.mark.parametrize("routers", [1, pytest.param(2, marks=pytest.mark.nightly)])
