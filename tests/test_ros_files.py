@@ -209,6 +209,25 @@ def test_nav2s_chain_ends_at_cmd_vel_in_one_type() -> None:
     assert stamped == [False] * 5
 
 
+def test_nav2_py_puts_the_robot_s_values_into_nav2_s_file_and_keeps_the_rest(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    parameters = (
+        "controller_frequency: 10.0, FollowPath: {plugin: MPPI, vx_max: 0.5}, plugins: [a, b]"
+    )
+    nav2 = tmp_path / "nav2.yaml"
+    nav2.write_text(f"controller_server: {{ros__parameters: {{{parameters}}}}}\n", encoding="utf-8")
+    monkeypatch.setattr(sys, "argv", ["nav2.py", str(nav2), str(FILES / "nav2_params.yaml")])
+    runpy.run_path(str(FILES / "nav2.py"))
+    printed = capsys.readouterr().out
+    # ROS refuses an integer where a node declares a double.
+    assert "controller_frequency: 20.0\n" in printed
+    controller = YAML(typ="safe").load(printed)["controller_server"]["ros__parameters"]
+    assert controller["plugins"] == ["a", "b"]
+    assert controller["FollowPath"]["plugin"] == "MPPI"
+    assert controller["FollowPath"]["vx_max"] == 1.0
+
+
 def leaves(tree: dict[str, Any]) -> list[tuple[str, Any]]:
     pairs: list[tuple[str, Any]] = []
     for key, value in tree.items():
