@@ -8,6 +8,7 @@ from __future__ import annotations
 import base64
 import hashlib
 import json
+import math
 import re
 import tempfile
 from collections.abc import Iterable, Iterator, Sequence
@@ -26,7 +27,7 @@ from acsard.core.ros.channels import BY_KEY, CMD_VEL_IN, LOG_CHANNEL
 from acsard.core.ros.shapes import LEVELS, Log, command_message
 from acsard.core.values import NS_PER_S, Twist
 from acsard.recording.file import Recording
-from acsard.recording.html_report import MAX_ROWS, Drawing, Rows, page
+from acsard.recording.html_report import MAX_EVENTS, MAX_ROWS, Drawing, Rows, page
 from acsard.recording.published import Published, published
 from tests.scenarios.taped import Tape, two_drivers
 from tests.scenarios.world import World
@@ -184,6 +185,19 @@ def test_every_event_has_a_row_with_the_client_that_caused_it() -> None:
     assert sum(len(mark["x"]) for mark in marks) == len(logs)
 
 
+def test_of_too_many_events_the_newest_are_shown_and_those_of_several_days_have_a_date() -> None:
+    events = [event(f"event {n}", at_ns=n) for n in range(MAX_EVENTS + 5)]
+    words = PageElements(report(events, "acsar", [])).words
+    assert f"{MAX_EVENTS} events, without the 5 earlier ones" in words
+    assert f"event {MAX_EVENTS + 4}" in words
+    assert "event 4" not in words
+    noon_ns = 1_800_014_400 * NS_PER_S
+    for apart_s, dated in ((60, False), (86_400, True)):
+        events = [event("a", at_ns=noon_ns), event("b", at_ns=noon_ns + apart_s * NS_PER_S)]
+        text = report(events, "acsar", [])
+        assert bool(re.search(r"<td>\d{4}-\d\d-\d\d \d\d:", text)) is dated
+
+
 def test_the_curves_are_the_messages() -> None:
     text = report(drive_of_two(), "acsar", [])
     sent = [item for item in drive_of_two() if item.channel.native == "cmd_vel_out"]
@@ -230,3 +244,11 @@ def test_a_long_curve_is_thinned_evenly_and_ends_with_its_last_row(count: int) -
     assert kept[-1] == ((count - 1) / 100, count - 1)
     steps = {round(b[1] - a[1]) for a, b in pairwise(kept[:-1])}
     assert len(steps) <= 1
+
+
+def test_a_curve_has_a_gap_where_messages_are_missing() -> None:
+    rows = Rows()
+    assert list(rows.rows()) == []
+    for t in (0.0, 0.5, 2.0, 2.5):
+        rows.add(t, t)
+    assert [math.isnan(value) for _, value in rows.rows()] == [False, False, True, False, False]
