@@ -24,6 +24,7 @@ from tests.firmware.board import (
 )
 from tests.firmware.conftest import ESTOP, FREE_SPEEDS
 from tests.system.harness import until
+from tests.system.typed import typed
 
 pytestmark = pytest.mark.firmware
 
@@ -217,6 +218,13 @@ def test_a_pressed_emergency_stop_is_off_reported_and_kept_until_zeros(
         assert not drives()
         host.send(STOP)
         assert drives()
+
+
+@pytest.mark.nightly
+def test_the_check_passes_the_sketch(runner: Path, sketch: Path) -> None:
+    with Board(runner, sketch, "--free-speed", FREE_SPEEDS) as board:
+        ended = typed("mcu", "check", "--port", board.path, "--yes", "--wheels-are-lifted")
+    assert ended.code == 0, ended.out
 
 
 MEASURE = """

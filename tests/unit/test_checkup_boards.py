@@ -25,7 +25,6 @@ from acsard.core.config.settings import (
     SimConfig,
     WheelMap,
 )
-from acsard.core.simulator import protocol
 from acsard.core.values import NS_PER_S
 from tests.each import each
 from tests.unit.checkup_robots import Checked, Nobody, Person, Robot, check
@@ -193,18 +192,6 @@ def test_the_check_names_each_fault_and_nothing_else(
     approved(WORDS / f"checkup_{page}.txt", text)
 
 
-@pytest.mark.variations(4)
-@pytest.mark.parametrize("fault", ["dead_motor=d", "stuck_encoder=d", "comma_latched"])
-@pytest.mark.parametrize("counts", [16, 48, 400])
-def test_coarse_encoders_change_no_verdict_on_the_last_motor(counts: int, fault: str) -> None:
-    checked = check(fault, config=Config(sim=SimConfig(encoder_counts=counts)))
-    if fault == "comma_latched":
-        assert checked.changes["mcu.trailing_comma"] is True
-    else:
-        assert checked.failed == ["motor d (rear right)"]
-        assert checked["trailing comma"].verdict == "SKIPPED"
-
-
 def test_every_step_has_a_finding() -> None:
     checked = check(person=True)
     names = {"motors" if f.name.startswith("motor ") else f.name for f in checked.findings}
@@ -264,20 +251,6 @@ def test_firmware_that_refuses_plain_lines_is_checked_to_the_end() -> None:
             super().send(b"".join(taken))
 
     assert Checked(Refuses()).failed == []
-
-
-def test_a_last_motor_that_obeys_zeros_only_with_a_comma_needs_the_trailing_comma() -> None:
-    def obeys(line: bytes) -> protocol.Command | None:
-        command = None if b"#" in line else protocol.reference(line)
-        if command and not command.values[3] and not line.endswith(b",\r\n"):
-            command.values.pop(3)
-        return command
-
-    robot = Robot()
-    robot.mcu.understand = obeys
-    checked = Checked(robot)
-    assert "still turns after zeros" in checked["trailing comma"].text
-    assert checked.changes["mcu.trailing_comma"] is True
 
 
 def test_the_check_waits_for_a_board_that_boots_when_the_port_opens() -> None:

@@ -11,11 +11,8 @@ from acsard.checkup.findings import Finding
 from acsard.checkup.lateness import (
     MAX_LATENESS_S,
     MAX_PAUSE_S,
-    MIN_DELAY_S,
-    HostDelays,
     is_doubtful,
 )
-from acsard.checkup.motion import LINE_PERIOD_S
 from acsard.checkup.outcomes import TimingFinding, find
 from acsard.core.simulator import protocol
 from tests.each import each
@@ -118,24 +115,6 @@ def test_no_motor_is_turned_again_after_a_silence() -> None:
     assert verdicts == ["FAIL", "WARN"]
 
 
-@pytest.mark.variations(6)
-@pytest.mark.parametrize("computer", [Busy, Starved])
-@pytest.mark.parametrize(
-    ("fault", "name"),
-    [
-        ("late_watchdog", "watchdog"),
-        ("watchdog_fed_by_bad_lines", "watchdog"),
-        ("bias=a:1.5", "motor a (front right)"),
-    ],
-)
-def test_a_fault_beyond_what_the_lateness_explains_is_reported(
-    computer: type[Busy], fault: str, name: str
-) -> None:
-    checked = Checked(computer(fault, late_s=0.03, every=3))
-    assert checked[name].verdict == "FAIL"
-    assert type(checked[name]) is Finding  # programs receive no further fields
-
-
 def test_a_later_step_reports_a_fault_that_an_earlier_step_could_not_judge() -> None:
     class Refuses(Busy):
         """A robot that ignores lines without a comma, on a computer that is late in one step."""
@@ -170,13 +149,6 @@ def test_a_later_step_reports_a_fault_that_an_earlier_step_could_not_judge() -> 
     assert matches[1].keys == {"mcu.trailing_comma": True}
 
 
-def test_the_largest_lateness_since_a_time_is_reported() -> None:
-    lateness = HostDelays()
-    for late_s, now_s in ((0.3, 1.0), (0.02, 2.0), (0.05, 3.0), (MIN_DELAY_S / 2, 4.0)):
-        lateness.record(late_s, now_s)
-    assert [lateness.since(s) for s in (0.0, 1.0, 1.5, 3.0, 3.5)] == [0.3, 0.3, 0.05, 0.05, 0.0]
-
-
 @each(
     ("outcome", "late_s", "doubted"),
     [
@@ -202,14 +174,3 @@ def test_only_outcomes_that_a_late_computer_can_cause_are_doubted(
     fields["margin_s"] = 0.5 if outcome == "motor: size" else 0.0
     result = find(outcome, **fields)
     assert (isinstance(result, TimingFinding) and is_doubtful(result, late_s)) is doubted
-
-
-def test_lateness_is_measured_for_every_duration_of_listening() -> None:
-    for seconds in (LINE_PERIOD_S, 0.5):
-        with Busy(late_s=0.08, every=7).board(rest=False) as board:
-            for _ in range(7):
-                board.listen(seconds)
-            assert board.lateness.since(0.0) == pytest.approx(0.08)
-    with Starved(late_s=0.08, every=7).board(rest=False) as board:
-        board.listen(0.5)
-        assert board.lateness.since(0.0) == pytest.approx(0.08)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import get_args
@@ -45,25 +44,6 @@ def test_counts_per_turn_are_measured_over_wraps_of_clock_and_counts(
     assert measured == pytest.approx(per_turn, rel=0.02)
 
 
-def test_too_short_a_turn_gives_no_counts_per_turn() -> None:
-    assert encoder_counts.per_turn(replies(3200)[:20], [0]) is None
-    assert encoder_counts.per_turn(replies(3200), [1]) is None
-    assert encoder_counts.per_turn(replies(3200), []) is None
-
-
-@pytest.mark.parametrize("counts", [16, 20, 40, 96])
-def test_coarse_encoders_without_configured_counts_are_a_warning(counts: int) -> None:
-    with Robot(config=Config(sim=SimConfig(encoder_counts=counts))).board() as board:
-        for motor in range(4):
-            turn(board, motor, 3.0)
-            board.stop_motors()
-        finding = encoder_counts.finding(board, [0, 1, 2, 3])
-    assert (finding.verdict, finding.keys) == ("WARN", {})
-    assert "write mcu.encoder_counts" in finding.mend
-    about = int(finding.figure.split()[1])
-    assert about == pytest.approx(counts, rel=0.2)
-
-
 @each(
     ("share", "words"),
     [(-1.0, "motor b (front left) run against"), (0.0, "do not change"), (2.0, "do not agree")],
@@ -88,21 +68,6 @@ def test_more_counts_than_the_host_accepts_are_a_warning() -> None:
     with Robot().board() as board:
         board.sampled, board.identity = True, {"counts": "400000"}
         assert encoder_counts.finding(board, []).verdict == "WARN"
-
-
-@pytest.mark.parametrize(
-    ("configured", "wrong"), [(1600, "100.0%"), (2700, "18.5%"), (3700, "13.5%"), (12800, "75.0%")]
-)
-def test_wrong_configured_counts_are_found_by_the_speeds_and_corrected(
-    configured: int, wrong: str
-) -> None:
-    with Robot("no_sample", link_check="on", encoder_counts=configured).board() as board:
-        board.sampled = True
-        board.replies = replies(3200)
-        finding = encoder_counts.finding(board, [0])
-    assert (finding.verdict, finding.keys) == ("FAIL", {"mcu.encoder_counts": 3200})
-    assert finding.figure == f"3200, not {configured}"
-    assert f"every distance would be wrong by {wrong}" in finding.text
 
 
 def test_counts_that_do_not_change_while_the_wheels_turn_are_to_be_switched_off() -> None:
@@ -186,19 +151,6 @@ def test_a_watchdog_time_within_the_contract_is_measured_and_passes(
     value, _, about = figure.partition(" ms")
     assert int(value) == pytest.approx(time_ms, abs=60 if about else 20)
     assert verdict == "PASS"
-
-
-@pytest.mark.variations(3)
-@pytest.mark.parametrize("kind", [("plain_only",), (), ("free_running",)])
-@pytest.mark.parametrize("lag", [0.05, 0.3])
-def test_the_run_out_of_a_motor_is_not_taken_for_the_watchdog(
-    kind: tuple[str, ...], lag: float
-) -> None:
-    config = Config(sim=SimConfig(motor_time_constant=lag))
-    for robot in (Robot, ByItsOwnClock):
-        verdict, figure = measured(robot(*kind, config=config))
-        assert int(figure.split()[0]) == pytest.approx(300, abs=80)
-        assert verdict == "PASS"
 
 
 def test_a_watchdog_too_short_for_any_host_is_a_warning() -> None:
@@ -290,20 +242,6 @@ def test_the_parser_refuses_every_broken_line(comma: bool, sealed: bool) -> None
             Codec(WheelMap()).decode(line.rstrip())
 
 
-def test_firmware_that_reads_a_last_number_that_is_cut_is_reported() -> None:
-    def scanned(line: bytes) -> protocol.Command | None:
-        """Parse as `sscanf` does: accept a last number whose end is missing."""
-        match = re.match(rb"ap(\d\d\.\d\d),bp(\d\d\.\d\d),cp(\d\d\.\d\d),dp([\d.]+),?\r\n\Z", line)
-        return match and protocol.Command({m: float(match[m + 1]) for m in range(4)})
-
-    robot = Robot()
-    with robot.board() as board:
-        robot.mcu.understand = scanned
-        finding = damage.finding(board, [0, 1, 2, 3])
-    assert finding.verdict == "FAIL"
-    assert finding.text.count("cut inside the last number") == 1
-
-
 def test_motors_that_do_not_turn_as_commanded_are_left_out() -> None:
     lines = damage.broken_lines(False, False, [1])
     assert all(b"ap03" not in line for _, line in lines)
@@ -329,17 +267,6 @@ def test_a_reply_period_that_the_configuration_refuses_is_not_advised(period_s: 
     assert (rate.verdict, rate.keys) == ("FAIL", {})
     assert "mcu.reply_period" not in rate.mend
     assert rate.mend.endswith("at least every 0.25 s")
-
-
-def test_the_advised_reply_period_is_not_rounded_above_the_limit(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.setattr(dialect, "MAX_REPLY_PERIOD_S", 0.15)
-    with Robot().board() as board, board.wire.mcu.sparse_replies(0.12):  # type: ignore[attr-defined]
-        rate = dialect.rate(board)
-    period = rate.keys["mcu.reply_period"]
-    assert isinstance(period, float)
-    assert 0.1 <= period <= 0.15
 
 
 def test_every_diagnosis_of_the_received_bytes_has_an_outcome_of_its_own() -> None:

@@ -208,15 +208,6 @@ def test_progress_does_not_go_into_a_pipe(
     assert on_terminal(80, lambda: called(tmp_path, *check), monkeypatch) == ""
 
 
-@pytest.mark.parametrize("typed", ["", "q\n", "what?\nQ\n"])
-def test_q_and_the_end_of_the_input_end_the_check(
-    typed: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(sys, "stdin", io.StringIO(typed))
-    with pytest.raises(KeyboardInterrupt):
-        TerminalPrompt().ask("lifted?", ("lifted",))
-
-
 def test_the_question_about_lifted_wheels_says_how_to_quit(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
