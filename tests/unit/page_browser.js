@@ -196,6 +196,7 @@ export const robot = {
   reachable: true, // connections to it open
   passes: true, // an open connection passes messages on
   talks: true, // it sends its state
+  beats: true, // it sends its beats
   ages: 0, // age of the states it sends, ms
   buffered: 0, // bytes that wait in the browser
   refusal: null, // the status and the reason with which it refuses this browser
@@ -274,7 +275,7 @@ export const robot = {
 const every = (ms, does) => timed(does, ms, ms);
 every(100, () => robot.now({}));
 every(50, () => {
-  robot.send({ key: "beat", value: { run: 1, boot_us: Math.round(now) } });
+  if (robot.beats) robot.send({ key: "beat", value: { run: 1, boot_us: Math.round(now) } });
   const { mode, sender } = robot.state;
   const silent = now - robot.last > 250;
   if (mode === "driving" && sender === robot.hello.sender && silent) robot.now({ mode: "ready", source: "", sender: "" });

@@ -617,6 +617,18 @@ for (const agrees of [false, true])
     says("mode", "READY");
   });
 
+story("after a reconnection the stick is grey until a beat of this connection arrives", async () => {
+  await open();
+  robot.beats = false;
+  robot.lose("", true);
+  await pass(2000);
+  says("mode", "READY");
+  assert.ok(grey("stick"));
+  robot.beats = true;
+  await pass(200);
+  assert.ok(!grey("stick"));
+});
+
 story("a page that is left disconnects, and connects again when the person comes back", async () => {
   await open();
   fire(window, "pagehide");
