@@ -6,10 +6,12 @@ from msgspec.structs import replace
 
 from acsard.client.follower import ROBOT_SILENCE_TIMEOUT_S, SETTLED_S, Follower
 from acsard.client.ride import (
+    MAX_SOURCE_TIMEOUT_S,
     OPEN_TIMEOUT_S,
     OPENING_PERIOD_S,
     SEND_PERIOD_S,
     SLOWS_S,
+    STALE_S,
     Ride,
 )
 from acsard.core.messages.schema import RobotState, SourceState
@@ -68,6 +70,9 @@ def test_a_wish_is_repeated_while_it_is_wanted_and_a_newer_one_replaces_it_at_on
     rider.wish(AHEAD, 1.0)
     assert rider.wish(AHEAD, 1.0) == [AHEAD] * round(1.0 / SEND_PERIOD_S)
     assert rider.wish(LEFT, 0.01) == [LEFT]
+    # A program that wishes nothing new sends no speed, and one without a wish no zero.
+    assert rider.ride.due(rider.now + STALE_S) == REST
+    assert Rider().wish(None, 1.0) == []
 
 
 def test_an_objection_ends_the_ride_until_the_person_lets_go() -> None:
@@ -153,3 +158,20 @@ def test_zeros_end_if_something_else_moves_the_robot_or_its_speed_is_unknown(
     rider.shows = state
     zeros = len(rider.wish(None, 5.0)) * SEND_PERIOD_S
     assert SLOWS_S <= zeros < SLOWS_S + 0.5
+
+
+def test_zeros_go_on_while_the_robot_slows_down_and_end_after_the_longest_timeout() -> None:
+    rider = Rider(MOVING)
+    rider.wish(AHEAD, 1.0)
+    for tenths in range(50, 0, -1):
+        rider.shows = replace(MOVING, linear=tenths / 100, angular=0.0)
+        assert rider.wish(None, 0.1)
+    rider.shows = RESTING
+    rider.wish(None, 0.2)
+    assert rider.wish(None, 5.0) == []
+    rider = Rider()
+    rider.wish(AHEAD, 1.0)
+    rider.shows = None
+    assert rider.wish(None, MAX_SOURCE_TIMEOUT_S - 0.1)[-1] == REST
+    rider.wish(None, 0.2)
+    assert rider.wish(None, 5.0) == []

@@ -32,8 +32,9 @@ def test_steps_outside_the_time_are_told_apart(tmp_path: Path) -> None:
     playback = Playback(recording)
     numbers = [s.number for s, _ in playback.steps() if recording.contains(s.now)]
     assert numbers == [n for n, s in enumerate(TAPE.taken) if times[0] <= s.now.wall_ns <= times[1]]
-    assert playback.comparison.steps == 200
-    assert playback.comparison.same
+    found = playback.comparison
+    assert (found.steps, found.modes_same, found.same) == (200, 200, True)
+    assert 0 < found.lines == found.lines_same <= 200
 
 
 def test_a_state_that_this_version_cannot_use_is_refused_in_words(tmp_path: Path) -> None:
