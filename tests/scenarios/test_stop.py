@@ -16,7 +16,6 @@ from acsard.core.messages.signature import public_name
 from acsard.core.ros.attachments import Attachment
 from acsard.core.ros.shapes import Trigger
 from acsard.core.values import NS_PER_S
-from tests.each import each
 from tests.scenarios.world import World, naming
 
 
@@ -76,22 +75,6 @@ def test_the_port_is_released_at_rest_until_the_next_activate() -> None:
     assert (world.state.mode, world.port.released) == ("inactive", True)
     assert world.call("activate").success
     assert (world.state.mode, world.port.released) == ("ready", False)
-
-
-@each("before", ["stop", "deactivate"])
-def test_the_port_of_a_robot_that_was_off_is_released_and_the_robot_stays_off(before: str) -> None:
-    world = World(Config(mcu=McuConfig(port="/dev/ttyACM0")))
-    world.run(1.0)
-    world.call(before)
-    world.run(1.0)
-    mode, reply = world.state.mode, world.call("deactivate", RELEASE)
-    assert (reply.success, reply.data.numbers, world.port.released) == (True, [], True)
-    assert not world.call("activate", naming([])).success
-    assert (world.state.mode, world.port.released) == (mode, False)
-
-
-def test_the_simulator_built_in_has_no_port_to_release(world: World) -> None:
-    assert not world.call("deactivate", RELEASE).success
 
 
 def test_shutting_down_ramps_to_rest_and_obeys_no_client(world: World) -> None:

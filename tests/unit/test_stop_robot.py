@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pytest
 
+from acsard.core.config.settings import Config, McuConfig
 from acsard.core.values import (
     REST,
     Request,
@@ -44,6 +45,30 @@ def test_a_clear_without_a_latch_changes_nothing_and_activate_asks_for_a_zero() 
     assert (out.mode, out.applied) == ("driving", GO)
     rig.step(GO, ask="activate")
     assert rig.drives()
+
+
+REAL = Config(mcu=McuConfig(port="/dev/ttyACM0"))
+
+
+@each("before", [None, "deactivate", "stop"])
+def test_the_port_is_released_at_rest_and_a_robot_that_was_off_stays_off(
+    before: Verb | None,
+) -> None:
+    rig = Rig(REAL).linked()
+    if before:
+        rig.answer(before)
+    mode = rig.mode
+    (answer,) = rig.asked(Request("deactivate", 1, release_port=True)).answers
+    assert (answer.success, len(answer.numbers)) == (True, 0 if before else 1)
+    assert (rig.robot.port_released, rig.mode) == (True, mode if before else "inactive")
+    rig.asked(Request("activate", 2, numbers=answer.numbers))
+    assert (rig.robot.port_released, rig.mode) == (False, mode)
+
+
+def test_neither_a_moving_robot_nor_the_simulator_built_in_releases_the_port() -> None:
+    for rig in (Rig(REAL).driving(), Rig().linked()):
+        (answer,) = rig.asked(Request("deactivate", 1, release_port=True)).answers
+        assert (answer.success, rig.robot.port_released) == (False, False)
 
 
 def test_several_requests_of_one_step_are_answered_in_order() -> None:
