@@ -313,7 +313,7 @@ def test_the_table_of_the_ros_page_lists_exactly_the_tools_of_this_module() -> N
     assert set(rows) - {"tool"} == {name for name, _, _ in STORIES}
 
 
-@pytest.mark.variations(28)
+@pytest.mark.slow
 @pytest.mark.parametrize("road", ["rmw", "bridge"])
 @pytest.mark.parametrize(("name", "kind", "steps"), STORIES)
 def test_a_tool_drives_after_what_the_page_says_and_not_before(
