@@ -18,6 +18,7 @@ from acsard.core.config.settings import (
 from acsard.core.messages.schema import Battery
 from acsard.core.simulator.fake_mcu import FakeMcu
 from acsard.core.values import NS_PER_S
+from tests.each import each
 from tests.scenarios.world import World
 from tests.stepped import Outputs
 
@@ -173,37 +174,6 @@ AWAY = Config(safety=SafetyConfig(bumpers=PLACES, bumper="away"))
 COMMANDS = ((0.8, 0.5), (-0.8, 0.5), (0.8, 0.0), (-0.8, 0.0), (0.0, 2.0), (0.05, -1.0))
 
 
-class Lines:
-    """Finds the first line that the daemon sends after a bumper is pressed."""
-
-    def __init__(self, world: World) -> None:
-        self.world = world
-        self.pressed_ns, self._before, self._lines, self._first = 0, False, 0, 0
-        self.applied: list[tuple[float, float]] = []
-        world.watch = self.note_press
-
-    def begin(self) -> None:
-        """Forget all earlier lines and speeds."""
-        self.world.port.sent.clear()
-        self.applied.clear()
-        self._lines = 0
-
-    def note_press(self, outputs: Outputs) -> None:
-        """Remember the time of the step in which the daemon reads the press."""
-        pressed = any(self.world.loop.robot.snapshot(outputs.now.mono_ns).bumpers or ())
-        if pressed > self._before:
-            self.pressed_ns, self._first = outputs.now.mono_ns, self._lines
-            self.applied.clear()
-        self._before, self._lines = pressed, len(self.world.port.sent)
-        self.applied.append((outputs.applied.linear, outputs.applied.angular))
-
-    @property
-    def first(self) -> tuple[int, bytes]:
-        """The time from the press to the first line after it, ns, and this line."""
-        at_ns, line = self.world.port.sent[self._first]
-        return at_ns - self.pressed_ns, line
-
-
 @pytest.mark.slow
 @pytest.mark.variations(4)
 @pytest.mark.parametrize("count", MOST)
@@ -234,44 +204,28 @@ def test_each_press_stops_the_robot_within_a_period_until_a_clear(
     assert slowest_ns <= world.period_ns
 
 
-@pytest.mark.slow
-@pytest.mark.variations(4)
-@pytest.mark.parametrize("count", [5, pytest.param(25, marks=pytest.mark.slow), MOST[1]])
-@pytest.mark.parametrize(("place", "sign"), [*zip(PLACES, (-1, 1, 0, 0), strict=True)])
-def test_a_limiting_bumper_stops_the_robot_within_a_period_and_allows_only_retreat(
-    place: Place, sign: int, count: int
-) -> None:
-    world, dice = World(AWAY), random.Random(count)
-    lines, slowest_ns, retreats = Lines(world), 0, 0
-    number = PLACES.index(place) + 1
+@each("place", PLACES)
+def test_a_limiting_bumper_stops_the_robot_and_allows_only_a_slow_retreat(place: Place) -> None:
+    """Each sender must send a zero first, and one that pushes does not drive on at the release."""
+    world, away = World(AWAY), {"front": -1, "rear": 1}.get(place, 0)
     with world.mcu.bumpers():
         world.run(0.5)
-        for _ in range(count):
-            lines.begin()
-            world.drive(*dice.choice(COMMANDS), seconds=0.5)
-            world.run(dice.uniform(0.0, 0.03))
-            with world.mcu.bumper_pressed(number, 0.0, 0.0):
-                world.hold(*dice.choice(COMMANDS), seconds=0.1)
-                waited_ns, line = lines.first
-                assert line.startswith(b"ap00.00,bp00.00,cp00.00,dp00.00")
-                slowest_ns = max(slowest_ns, waited_ns)
-                assert world.state.code in ("bumper_away", "bumper_blocks")
-                # Each sender must send a zero first.
-                assert {*lines.applied} == {(0.0, 0.0)}
-                for command in dice.sample(COMMANDS, 3):
-                    world.drive(*command, seconds=0.4)
-                    assert world.state.mode == ("driving" if command[0] * sign > 0 else "ready")
-                assert all(0.0 <= v * sign <= 0.1 and w == 0.0 for v, w in lines.applied)
-                assert sign or {*lines.applied} == {(0.0, 0.0)}
-                retreats += any(v for v, _ in lines.applied)
-                world.hold(-0.8 * (sign or 1), seconds=0.2)
-                lines.applied.clear()
-            # A sender that pushed against the obstacle at the release does not drive on.
-            world.hold(-0.8 * (sign or 1), seconds=0.3)
-            assert {*lines.applied} == {(0.0, 0.0)}
-            assert world.newest == 0
-    assert slowest_ns <= world.period_ns
-    assert (retreats > 0) == (sign != 0)
+        world.drive(0.5, seconds=1.0)
+        with world.mcu.bumper_pressed(PLACES.index(place) + 1, 0.0, 0.0):
+            world.hold(0.5, seconds=0.2)
+            assert world.lines()[-1].startswith(ZERO)
+            assert world.state.code in ("bumper_away", "bumper_blocks")
+            for speed in (0.8, -0.8, 0.8):
+                world.drive(speed, 0.5, seconds=0.7)
+                retreats = speed * away > 0
+                assert world.state.mode == ("driving" if retreats else "ready")
+                assert world.outputs is not None
+                applied = world.outputs.applied
+                assert applied.linear == pytest.approx(0.1 * away if retreats else 0.0)
+                assert applied.angular == 0.0
+            world.hold(-0.8 * (away or 1), seconds=0.2)
+        world.hold(-0.8 * (away or 1), seconds=0.3)
+        assert (world.state.mode, world.newest) == ("ready", 0)
 
 
 # the battery
