@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from acsard.core.config.settings import Config, McuConfig
+from acsard.core.config.settings import Config, McuConfig, OdometryConfig
 from acsard.core.values import (
     REST,
     Request,
@@ -69,6 +69,25 @@ def test_neither_a_moving_robot_nor_the_simulator_built_in_releases_the_port() -
     for rig in (Rig(REAL).driving(), Rig().linked()):
         (answer,) = rig.asked(Request("deactivate", 1, release_port=True)).answers
         assert (answer.success, rig.robot.port_released) == (False, False)
+
+
+def test_a_stop_that_comes_by_several_ways_is_one_event() -> None:
+    rig, stop = Rig().linked(), Request("stop", by="ann", asked_ns=1)
+    out = rig.asked(stop, stop)
+    assert [event.name for event in out.events].count("stop") == 1
+
+
+def test_missed_periods_are_counted_and_reported() -> None:
+    rig = Rig().linked()
+    out = rig.step(missed=3)
+    assert rig.robot.counters["missed_periods"] == 3
+    assert "missed_periods" in [event.name for event in out.events]
+
+
+def test_the_samples_of_a_gyro_reach_its_check() -> None:
+    rig = Rig(Config(odometry=OdometryConfig(gyro=True))).linked()
+    rig.run(500, gyro=0.01)
+    assert rig.snapshot.gyro.bias == pytest.approx(0.01)
 
 
 def test_several_requests_of_one_step_are_answered_in_order() -> None:
