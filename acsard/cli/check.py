@@ -5,7 +5,9 @@ print all of them, each with its fix, and exit with code 78.
 from __future__ import annotations
 
 import argparse
+import os
 import sys
+from pathlib import Path
 
 import msgspec
 
@@ -14,15 +16,26 @@ from acsard.core.config.contradictions import warnings
 from acsard.core.config.parsing import effective
 from acsard.core.config.toml_text import document
 from acsard.core.formatting import json_line
+from acsard.host.errors import MendableError
+from acsard.machine.deploy_files import reference, source
+
+STDOUT = 1
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     add_config(parser)
     parser.add_argument("--json", action="store_true", help="print JSON instead of TOML")
+    parser.add_argument(
+        "--new", type=Path, metavar="FILE",
+        help="only write a new FILE: all settings with their defaults and explanations",
+    )  # fmt: skip
 
 
 def main(args: argparse.Namespace) -> int:
+    if args.new:
+        return _write_new(args.new)
     where, config = load(args.config)
+    _require_other_output(where)
     plain = effective(config)
     if args.json:
         print(json_line(msgspec.json.encode(plain).decode()))
@@ -32,3 +45,31 @@ def main(args: argparse.Namespace) -> int:
     for text in warnings(config):
         print(f"{where}: warning: {text}", file=sys.stderr)
     return 0
+
+
+def _write_new(file: Path) -> int:
+    text = reference(source()).read_bytes()
+    try:
+        with file.open("xb") as new:
+            new.write(text)
+    except FileExistsError:
+        raise MendableError(
+            f"{file} exists already, and was not changed: edit it, or name another file"
+        ) from None
+    except OSError as error:
+        raise MendableError(f"cannot write {file}: {error.strerror}") from None
+    print(f"{file} has all settings with their defaults")
+    return 0
+
+
+def _require_other_output(where: str) -> None:
+    # The shell has emptied FILE before `acsard check > FILE` reads it: only defaults are left.
+    try:
+        same = os.path.samestat(os.stat(where), os.fstat(STDOUT))
+    except OSError:  # the built-in defaults have no file
+        return
+    if same:
+        raise MendableError(
+            f"the output goes into {where}, which acsard reads: the shell empties the file of `>` "
+            "before acsard starts. Restore its settings; `acsard check --new FILE` makes a new file"
+        )

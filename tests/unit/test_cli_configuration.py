@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import argparse
+import os
+import subprocess
 import sys
 from collections.abc import Callable, Iterable
 from pathlib import Path
@@ -168,11 +170,36 @@ def test_a_good_file_is_printed_with_its_place_and_its_warnings(
 ) -> None:
     file = tmp_path / "robot.toml"
     file.write_text("[mcu]\nbaud_rate = 9600\n[control]\nrate = 29\n")
-    assert main(argparse.Namespace(config=str(file), json=False)) == 0
+    assert main(argparse.Namespace(config=str(file), json=False, new=None)) == 0
     out, err = capsys.readouterr()
     assert out.startswith(f"# effective configuration from {file}\n")
     assert parse(out.encode()) == parse(file.read_bytes())
     assert err.startswith(f"{file}: warning: control.rate = 29 ")
+
+
+@pytest.mark.parametrize("sign", [">", ">>"])
+def test_a_file_that_is_read_is_not_the_output_too(tmp_path: Path, sign: str) -> None:
+    file = tmp_path / "robot.toml"
+    file.write_text("[mcu]\nbaud_rate = 57600\n")
+    done = subprocess.run(
+        ["sh", "-c", f'"{sys.executable}" -m acsard check {sign} robot.toml'],
+        cwd=tmp_path, env=os.environ | {"ACSARD_CONFIG": "robot.toml"}, capture_output=True,
+        text=True, timeout=30.0, check=False,
+    )  # fmt: skip
+    assert done.returncode == Exit.FAILURE
+    assert "the output goes into robot.toml, which acsard reads" in done.stderr
+    assert file.read_text() == ("" if sign == ">" else "[mcu]\nbaud_rate = 57600\n")
+
+
+def test_a_new_file_has_the_explained_defaults_and_is_never_written_twice(tmp_path: Path) -> None:
+    file = tmp_path / "robot.toml"
+    args = parser(["check"]).parse_args(["check", "--new", str(file)])
+    assert main(args) == 0
+    assert file.read_bytes() == Path("acsard.toml").read_bytes()
+    file.write_text("[mcu]\nbaud_rate = 57600\n")
+    with pytest.raises(MendableError, match="exists already, and was not changed"):
+        main(args)
+    assert file.read_text() == "[mcu]\nbaud_rate = 57600\n"
 
 
 def given_by(words: Iterable[str]) -> dict[str, object]:
