@@ -107,6 +107,19 @@ def test_a_bag_is_a_directory_whose_metadata_match_its_file(path: Path, tmp_path
     assert set(latched.values()) == {"VOLATILE"}
 
 
+def test_only_messages_of_the_time_span_are_written(path: Path, tmp_path: Path) -> None:
+    new = tmp_path / "new.mcap"
+    begin_ns, end_ns = START.wall_ns + 5 * 10**8, START.wall_ns + 10**9
+    export(part_of(path, 0.5, 1.0), new, "mcap")
+    with new.open("rb") as stream:
+        found = [(c.topic, m.log_time) for _, c, m in make_reader(stream).iter_messages()]
+    times = [at_ns for topic, at_ns in found if topic == "/odom"]
+    # The first message is latched: without it, viewers do not know where the lidar is.
+    assert found[0][0] == "/tf_static"
+    assert begin_ns <= min(times) < begin_ns + 20_000_000
+    assert end_ns - 20_000_000 < max(times) <= end_ns
+
+
 def test_a_time_span_without_messages_writes_no_file(path: Path, tmp_path: Path) -> None:
     with pytest.raises(RecordingError, match="nothing to export"):
         export(part_of(path, 1000.0, 1001.0), tmp_path / "new.mcap", "mcap")
