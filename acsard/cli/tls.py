@@ -57,7 +57,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         "name",
         type=_name,
         metavar="NAME",
-        help="common name of the new certificate, e.g. laptop-anna",
+        help="common name of the new certificate, e.g. laptop",
     )
     more.add_argument(
         "--role",

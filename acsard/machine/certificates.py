@@ -118,7 +118,7 @@ def renew(directory: Path, addresses: Sequence[str], days: int) -> list[str]:
 
 
 def _names_of(name: str) -> list[str]:
-    # If a certificate contains no host name, OpenSSL treats its common name, such as `anna.meyer`,
+    # If a certificate contains no host name, OpenSSL treats its common name, such as `a.person`,
     # as a host name. If the authority may not sign for this host name, OpenSSL refuses the
     # certificate.
     named = [name] if ADDRESS.match(name) else []
