@@ -112,7 +112,8 @@ def test_a_press_counts_at_once_until_the_release_and_silence_after_half_a_secon
     assert pin.why is None
     assert pin.step(press, free) == "released"  # in one read
     assert pin.part.pressed_now is not None
-    assert [c for _, c in pin.events if c] == [code, code]
+    name = "bumper_pressed" if code == "bumper" else code
+    assert [event for event in pin.events if event[1]] == [(name, code)] * 2
     for before in (press, free):
         pin.step(before)
         assert pin.quiet(500) == ("pressed" if before == press else "released")

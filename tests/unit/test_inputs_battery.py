@@ -40,7 +40,7 @@ class Pack:
         events = self.battery.process_reports(reports, self.now_ms * MS, self.linked, self.config)
         self.events += [(event.name, event.text) for event in events]
         self.stops += self.battery.stopped_now
-        return None if self.battery.status is None else self.battery.status.level
+        return self.battery.level or None
 
     def at(self, volts: float, seconds: float, ms: int = 100) -> BatteryLevel | None:
         """Report this voltage for this time, once every `ms`."""

@@ -136,6 +136,7 @@ def test_each_period_has_its_line_or_an_early_one_and_no_traffic_makes_more(
             early = False
         sent_ns = lines[-1] if lines else -GAP_NS
         due = tick or (news and pace.at_once(now_ns, sent_ns))
+        assert tick or not due or now_ns - sent_ns >= GAP_NS
         sent = due and not blocked and (not lines or now_ns - lines[-1] >= WIRE_NS)
         lines += [now_ns] * sent
         early |= sent and not tick

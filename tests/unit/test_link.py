@@ -10,6 +10,7 @@ from acsard.core.config.settings import FeedbackConfig, McuConfig
 from acsard.core.config.wire_time import wire_ns
 from acsard.core.link.feedback import MIN_INTERVAL_NS
 from acsard.core.link.link_setup import LinkSetup
+from acsard.core.link.link_state import Link
 from acsard.core.link.session import LONG_GAP_NS, McuSession
 from acsard.core.values import NS_PER_S, Instant, Received, WheelSpeeds
 from tests.each import each
@@ -118,6 +119,19 @@ def test_a_session_restarts_with_the_port_and_after_a_long_gap(case: str) -> Non
 
 
 # the state of the link
+
+
+def test_lines_further_apart_than_the_silence_limit_make_no_link() -> None:
+    link, sparse = Link(), []
+    link.apply("opened")
+    for number in range(12):
+        link.good(number * 101 * MS, 100 * MS)
+        link.judge(number * 101 * MS, True, False)
+        assert link.state == "booting"
+        sparse.append(link.sparse_s)
+    assert (sparse[1], sparse[-1]) == (0.0, 0.101)  # a single one proves nothing
+    link.good(12 * 101 * MS - 50 * MS, 100 * MS)
+    assert link.sparse_s == 0.0
 
 
 # the time of a line

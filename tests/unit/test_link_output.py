@@ -8,6 +8,7 @@ from hypothesis import strategies as st
 from acsard.core.config.settings import McuConfig
 from acsard.core.link.checked_line import SAMPLE_REQUEST, seal
 from acsard.core.link.serial_output import SerialOutput
+from acsard.core.values import STILL
 from tests.each import each
 from tests.unit.link_bench import CHECKED, MS, PLAIN, STOP, LinkBench
 from tests.vectors.lines import ZERO
@@ -131,3 +132,22 @@ def test_a_session_begins_with_a_plain_stop_and_the_question_follows_the_first_l
 
 
 # when rest was commanded
+
+
+def test_a_silent_board_gets_a_stop_without_delay_and_then_ten_a_second() -> None:
+    bench = LinkBench().up()
+    assert bench.line(STILL) == STOP
+    while not bench.session.silent(bench.now_ns):
+        assert bench.line() == b"ap01.00,bp01.00,cp01.00,dp01.00\r\n"
+        bench.wait(10)
+    assert bench.line() == STOP
+    lines = []
+    for _ in range(100):
+        bench.wait(10)
+        lines.append(bench.line())
+    assert [line for line in lines if line] == [STOP] * 10
+    # A board that reports by its own clock gets no more time behind a late step: its lines would
+    # wait in the kernel.
+    free = LinkBench(McuConfig(reply_period=0.02)).up()
+    free.wait(150)
+    assert free.link == "stale"

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from acsard.core.link.codec import Motors
 from acsard.core.link.feedback import Feedback
-from acsard.core.link.quantization import BLOCK_STEPS, CountRecovery, Steps
+from acsard.core.link.quantization import BLOCK_STEPS, FIRST_STEPS, CountRecovery, Steps
 from acsard.core.link.whole_counts import MAX_DOUBT
 from acsard.core.link.whole_counts import WholeCounts as Recovered
 from acsard.core.values import Instant, WheelSpeeds
@@ -75,15 +75,36 @@ def test_without_configured_counts_no_line_has_whole_counts_and_coarse_lines_are
         assert (recovery.coarse_lines > 1000) == coarse == bool(recovery.coarse_lines)
 
 
-@each("damage", [[], [40.0, 12.0], [0.0, 30.0] * BLOCK_STEPS])
-def test_a_quantization_step_that_does_not_recur_is_no_step_or_forgotten(
-    damage: list[float],
-) -> None:
-    dice, steps = random.Random(1), Steps()
-    fine = [round(10 + dice.uniform(-0.2, 0.2) + 0.02 * i, 2) for i in range(3 * BLOCK_STEPS)]
-    for speed in [*fine[:9], *damage, *fine]:
+def steps_after(speeds: list[float], steps: Steps | None = None) -> Steps:
+    steps = steps or Steps()
+    for speed in speeds:
         steps.add(speed)
-    assert steps.size < 0.5
+    return steps
+
+
+def fine_speeds(count: int) -> list[float]:
+    dice = random.Random(1)
+    return [round(10 + dice.uniform(-0.2, 0.2) + 0.02 * i, 2) for i in range(count)]
+
+
+def test_a_quantization_step_is_known_once_it_has_recurred_and_while_it_does() -> None:
+    steps = steps_after([0.1 * (i % 2) for i in range(FIRST_STEPS)])
+    assert steps.size == math.inf
+    assert steps_after([0.2], steps).size < 0.3
+    steps = steps_after(fine_speeds(2 * BLOCK_STEPS + 8))
+    assert steps_after([40.0, 12.0], steps).size < 0.5
+    steps = steps_after([0.0, 30.0] * BLOCK_STEPS)
+    assert steps.size == 30.0
+    assert steps_after(fine_speeds(3 * BLOCK_STEPS), steps).size < 0.5
+
+
+def test_a_randomly_jumping_wheel_beside_three_fine_ones_is_not_a_coarse_encoder() -> None:
+    dice, recovery = random.Random(1), CountRecovery()
+    for _ in range(1000):
+        fine = [round(5.0 + dice.uniform(-0.1, 0.1), 2) for _ in range(3)]
+        speeds = WheelSpeeds(round(dice.uniform(-70.0, 70.0), 2), *fine)
+        line = recovery.recover_counts(Feedback(AT, speeds, 0.01), 0.0)
+    assert max(line.steps) < 1.0
 
 
 class WholeCounts:
