@@ -8,6 +8,7 @@ from collections.abc import Callable
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from msgspec.structs import replace
 
 from acsard.core.config.settings import DriveConfig, OdometryConfig
 from acsard.core.motion.gyro import Gyro, claims
@@ -46,6 +47,7 @@ class Bench:
         self.none, self.does = 0, list[GyroDoes]()
         self.silent = self.other = False  # `other`: the next sample is the first of another sender
         self.distort: Rate = lambda rate: rate  # what the gyro reports instead of the given rate
+        self.held_back_ns = 0  # until then no sample arrives; then they come together
         self._samples = first
         self._way: list[GyroSample] = []
         self._sampled_ns, self._sampled = self.now_ns, 0.0
@@ -83,9 +85,11 @@ class Bench:
         return self
 
     def arrived(self) -> tuple[GyroSample, ...]:
-        samples = tuple(sample for sample in self._way if sample.at_ns <= self.now_ns)
-        self._way = [sample for sample in self._way if sample.at_ns > self.now_ns]
-        return samples
+        came, way = [s for s in self._way if s.at_ns <= self.now_ns], self._way
+        if self.now_ns <= self.held_back_ns:
+            return ()
+        self._way = way[len(came) :]
+        return tuple(replace(s, at_ns=max(s.at_ns, self.held_back_ns)) for s in came)
 
     def sample(self) -> None:
         span_ns = self.now_ns - self._sampled_ns

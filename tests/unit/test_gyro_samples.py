@@ -38,6 +38,16 @@ def test_stamps_remove_the_jitter_of_the_transmission_and_one_wrong_stamp_spoils
     assert bench.off < 0.02 * bench.true
 
 
+@each("back_ms", [150, 210, 230, 290, 400])
+def test_a_turn_that_was_assumed_during_a_silence_is_not_counted_twice(back_ms: int) -> None:
+    for rate in (1.0, -2.0):
+        bench = Bench(stamped=True).run(1.0, rate)
+        bench.held_back_ns = bench.now_ns + back_ms * MS
+        bench.run(2.0, rate)
+        assert bench.says == "used"
+        assert bench.off < 0.01 * abs(rate)
+
+
 def test_a_late_gyro_is_not_silent() -> None:
     bench = Bench(late_ms=150, sample_ms=100)
     for _ in range(5):

@@ -75,6 +75,15 @@ def test_without_configured_counts_no_line_has_whole_counts_and_coarse_lines_are
         assert (recovery.coarse_lines > 1000) == coarse == bool(recovery.coarse_lines)
 
 
+def test_after_forgetting_no_step_is_known() -> None:
+    recovery = CountRecovery()
+    rows = [Feedback(AT, WheelSpeeds(*speeds), PERIOD) for speeds, _ in lines(400)]
+    for line in rows:
+        recovery.recover_counts(line, 0.0)
+    recovery.forget()
+    assert recovery.recover_counts(rows[500], 0.0).steps == (math.inf,) * 4
+
+
 def steps_after(speeds: list[float], steps: Steps | None = None) -> Steps:
     steps = steps or Steps()
     for speed in speeds:
