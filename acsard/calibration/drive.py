@@ -199,7 +199,7 @@ class Recorder:
     def ride(self, leg: Leg) -> Run:
         """Drive a leg, and return its recording.
 
-        Raises `NotDrivenError` if the robot does not follow, and `LogError` if a key was pressed or
+        Raises `NotDrivenError` if the robot does not follow or a person stops it, and `LogError` if
         the sensors cannot be used.
         """
         self._receive()
@@ -231,15 +231,14 @@ class Recorder:
                     if self._prompt.keys(POLL_S):
                         if by_key:
                             break
-                        raise LogError("a key was pressed, so the drive has ended")
+                        raise NotDrivenError("a key was pressed")
                     if passed - checked >= CHECK_S:
                         checked = passed
                         require_path(move, self._wheels.rows[first:], base, passed)
                 else:
                     if by_key:
-                        raise LogError(
-                            "no key was pressed, although the robot must have turned a full "
-                            "circle: start again, and press SPACE at the end of the circle"
+                        raise NotDrivenError(
+                            "no key was pressed, although the robot must have turned a full circle"
                         )
                     require_path(move, self._wheels.rows[first:], base)
             done += move.seconds

@@ -29,8 +29,7 @@ from acsard.terminal.prompt import NumberQuestion, Prompt
 
 SOURCE = "app"
 
-MAX_REPEATS = 2  # of a leg that was disturbed
-UNITS = {"m": 1.0, "mm": 1e-3}
+MAX_REPEATS = 20  # of a leg: then nobody is there who could type "q"
 
 # Standard deviations of what a person reads, m, and of skidding, per root of a metre and relative.
 TAPE_STD_M, LINE_STD_M = 0.005, 0.002
@@ -140,14 +139,15 @@ def guided(method: str, setup: Setup, prompt: Prompt, ride: Ride) -> Log:
     )
 
     def number(ask: NumberQuestion) -> Metres:
-        return UNITS[ask.unit] * prompt.number(ask)
+        return prompt.number(ask) / 1000
 
     wheelbase = number(WHEELBASE) if method == "tape" else 0.0
     runs: list[Run] = []
     track, slope = 1.0, 0.0  # of the robot to the line, rad
     while len(runs) < len(plan := legs(method, setup, track)):
         leg = plan[len(runs)]
-        words = f"{len(runs) + 1}. {leg.words} ({leg.seconds:.0f} s)"
+        end = "" if leg.by_key else " It stops by itself: press a key only if you must stop it."
+        words = f"{len(runs) + 1}. {leg.words}{end} ({leg.seconds:.0f} s)"
         run = _repeated(leg, words, prompt, ride)
         found = {ask.name: number(ask) for ask in leg.asks}
         readings = []
@@ -174,7 +174,7 @@ def _repeated(leg: Leg, words: str, prompt: Prompt, ride: Ride) -> Run:
         except NotDrivenError as error:
             if not left:
                 raise
-            prompt.show_text(f"This leg was disturbed: {error}")
+            prompt.show_text(f"This leg has ended early: {error}")
             prompt.instruct("Put the robot back where and how the leg began. Then start it again.")
     raise AssertionError
 

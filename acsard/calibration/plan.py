@@ -14,6 +14,7 @@ from msgspec.structs import replace
 
 from acsard.calibration.log import LogError
 from acsard.core.config.settings import Config, DriveConfig
+from acsard.core.formatting import many
 from acsard.core.motion.kinematics import Kinematics
 from acsard.core.values import Metres, RadPerS, Seconds, Twist
 from acsard.terminal.prompt import NumberQuestion
@@ -63,8 +64,8 @@ class Leg(Struct, frozen=True):
 
 
 FROM_MARK = NumberQuestion(
-    "How far is the marked wheel from its mark now, in a straight line?", "m", 0.5, 2 * FLOOR_M,
-    name="distance",
+    "How far is the marked wheel from its mark now, in a straight line?", "mm", 500,
+    2000 * FLOOR_M, name="distance",
 )  # fmt: skip
 TO_LINE = tuple(
     NumberQuestion(
@@ -165,7 +166,7 @@ def _place(setup: Setup) -> str:
 def _sensor(setup: Setup, *, tape: bool) -> tuple[Leg, ...]:
     optional = replace(
         FROM_MARK, words=f"{FROM_MARK.words} If you did not measure it, press only Enter",
-        least=0.0, usual=0.0,
+        usual=0.0,
     )  # fmt: skip
     back = setup.ahead(FLOOR_M / 2 - setup.from_edge - setup.length)
     moves = [PAUSE, back, PAUSE]
@@ -200,7 +201,8 @@ def _tape(setup: Setup, track: float) -> tuple[Leg, ...]:
         once = setup.spin(side * 2 * math.pi, rate, track)
         count = max(1, min(3, int(MAX_SPIN_S / once.seconds)))
         return Leg(
-            name, f"The robot turns {count} full circles to the {'left' if side > 0 else 'right'}.",
+            name,
+            f"The robot turns {many(count, 'full circle')} {'left' if side > 0 else 'right'}.",
             (replace(once, seconds=count * once.seconds),), TO_LINE, side * 2 * math.pi * count,
         )  # fmt: skip
 
@@ -216,7 +218,7 @@ def _tape(setup: Setup, track: float) -> tuple[Leg, ...]:
         ),
         Leg(
             "round",
-            "The robot drives back to the middle of the floor, and turns left in place. Press "
+            "The robot drives back to the middle of the floor, and then turns left in place. Press "
             "SPACE when it has turned one full circle and faces along the line as before; an error "
             "of 20 deg does not matter.",
             (back, PAUSE, longest), TO_LINE, 2 * math.pi, by_key=True,

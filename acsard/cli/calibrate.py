@@ -34,7 +34,7 @@ from acsard.terminal.prompt import NobodyError, Prompt, TerminalPrompt, ended_by
 DRIVE = """\
 Drive the robot, and guide a person at this terminal. The person stands near the robot on a free
 floor of 3 m x 3 m, starts each leg with Enter, stops it with any key, and types the distances that
-the tool asks for. The robot drives for at most 90 s.
+the tool asks for. The tool says first for how long the robot drives at most.
 """
 
 LOG = """\

@@ -55,8 +55,10 @@ class NumberQuestion(Struct, frozen=True):
 
         Raises `ValueError` with a description of valid numbers.
         """
+        if not text and self.usual is not None:
+            return self.usual
         try:
-            number = self.usual if not text else float(text.replace(",", "."))
+            number = float(text.replace(",", "."))
         except ValueError:
             number = None
         if number is None or not self.least <= number <= self.most:
@@ -198,9 +200,10 @@ class TerminalPrompt(Prompt):
         # A terminal that does not read, for example over a connection that hangs, must not keep a
         # key from stopping the robot.
         if sys.stderr.isatty() and has_room(sys.stderr):
-            done = round(BAR_WIDTH * share)
+            done = int(BAR_WIDTH * share)  # full only at the end, when keys do nothing more
             bar = "#" * done + "." * (BAR_WIDTH - done)
-            self._print(f"\r[{bar}] any key stops {'' if share < 1.0 else chr(10)}")
+            after = "any key stops " if share < 1.0 else "\033[K\n"
+            self._print(f"\r[{bar}] {after}")
 
 
 def row(finding: Finding) -> Table:

@@ -21,7 +21,7 @@ from acsard.terminal.prompt import NobodyError, NumberQuestion, Prompt, Terminal
 from tests.system.harness import until
 
 DISTANCE = NumberQuestion("How far?", "m", 0.5, 3.0)
-OPTIONAL = NumberQuestion("How far, if you like?", "m", 0.0, 3.0, 0.0)
+OPTIONAL = NumberQuestion("How far, if you like?", "m", 0.5, 3.0, 0.0)
 
 pytestmark = pytest.mark.timeout(30)
 
@@ -64,7 +64,21 @@ def test_a_number_is_asked_for_until_it_is_valid_and_within_its_bounds(
     terminal.answers("far\n", "0.1\n", "-2\n", "\n", "1,75\n")
     with single_key_mode():
         assert TerminalPrompt().number(DISTANCE) == 1.75
-    assert capsys.readouterr().err.count("from 0.5 to 3") == 4
+        terminal.answers("0.1\n", "\n")
+        assert TerminalPrompt().number(OPTIONAL) == 0.0
+    assert capsys.readouterr().err.count("from 0.5 to 3") == 5
+
+
+def test_the_bar_is_full_only_when_keys_stop_nothing_any_more(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    master, slave = pty.openpty()
+    with open(slave, "w") as screen, open(master, "rb", buffering=0) as seen:
+        monkeypatch.setattr("sys.stderr", screen)
+        for share, full, keys in ((0.99, False, True), (1.0, True, False)):
+            TerminalPrompt().progress(share)
+            shown = seen.read(256)
+            assert (b"." not in shown, b"any key stops" in shown) == (full, keys)
 
 
 @pytest.mark.parametrize("asked", [lambda p: p.number(DISTANCE), lambda p: p.start("Go.")])
