@@ -61,7 +61,7 @@ MAX_SIDE_DIFFERENCE = 0.8  # of front and rear wheel, as a share of the rolled a
 ADVICE = (
     "write a CSV file with commas, decimal points and SI units, whose first line names the columns "
     'like "t,left,right,yaw_rate" or "t,fr,fl,rl,rr,x,y" (page reference/csv of the manual explains'
-    " the columns, and page howto/bag how to convert a ROS bag)"
+    " the columns, and page howto/calibrate-log how to convert a ROS bag)"
 )
 
 

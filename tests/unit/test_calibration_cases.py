@@ -168,7 +168,7 @@ def test_a_clock_that_is_set_back_begins_a_new_run_of_a_csv_file() -> None:
 
 
 def test_the_command_of_the_page_converts_a_bag(tmp_path: Path) -> None:
-    page = (SCRIPT.parents[1] / "manual/pages/howto/bag.md").read_text()
+    page = (SCRIPT.parents[1] / "manual/pages/howto/calibrate-log.md").read_text()
     name = f"$ python3 {SCRIPT.name} "
     (command,) = (line for line in page.splitlines() if line.startswith(name))
 
