@@ -117,6 +117,7 @@ PERIOD_NS = 10 * MS
 GAP_NS = WIRE_NS + REPLY_TIME_NS
 
 
+@settings(max_examples=100)
 @given(st.lists(st.tuples(st.integers(1, 12), st.booleans(), st.booleans()), max_size=200))
 def test_each_period_has_its_line_or_an_early_one_and_no_traffic_makes_more(
     wakes: list[tuple[int, bool, bool]],
