@@ -161,6 +161,10 @@ FAIL? motor: dead, not seen | {figure}
 FAIL? motor: dead, still | {figure}
     motor {here} does not turn
     -> check the driver with its enable input, the fuse and the leads of motor {here}
+FAIL motors: still | no wheel turns
+    the board answers, but no encoder shows that a motor turns
+    -> is the motors' supply on, the emergency stop released, the drivers' enable input connected?
+    If the wheels do turn, check the supply and the ground of the encoders
 FAIL? motor: dead, turns | {figure}
     the wheel turns, but encoder {here} shows nothing: the encoder is dead
     -> check the supply, the plug and the A and B leads of encoder {here}

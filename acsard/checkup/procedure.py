@@ -184,8 +184,7 @@ class _Steps:
         for doing, step in SILENT_STEPS:
             self._measure(doing, partial(step, board))
         self._take("", self._stop_and_arm)
-        for motor in range(4):
-            self._take("", partial(self._turn, motor))
+        self._turn_motors()
         channels = self._channels
         self._take("", lambda: dialect.comma(board, channels[-1].kind in ("dead", "late")))
         self._take("", board.repeats.finding)
@@ -201,6 +200,21 @@ class _Steps:
     def _stop_and_arm(self) -> None:
         self._board.stop_motors()
         self._board.armed = True
+
+    def _turn_motors(self) -> None:
+        # Wait with the findings of motors that do not turn until one turns: if none does, one cause
+        # is more likely than four.
+        still: list[Finding | None] = []
+        try:
+            for motor in range(4):
+                self._take("", partial(self._turn, motor), still.append)
+                while still and not all(map(wheels.stands, self._channels)):
+                    self._tell(still.pop(0))
+            if still:
+                still = [outcomes.find("motors: still")]
+        finally:
+            for finding in still:
+                self._tell(finding)
 
     def _turn(self, motor: int) -> Finding:
         board, operator, channels = self._board, self._operator, self._channels
@@ -255,7 +269,9 @@ class _Steps:
             raise StoppedError(finding)
         return finding
 
-    def _take(self, doing: str, step: Step) -> None:
+    def _take(
+        self, doing: str, step: Step, tell: Callable[[Finding | None], None] | None = None
+    ) -> None:
         board, again = self._board, 0
         saved = board.saved_results
         while True:
@@ -264,7 +280,7 @@ class _Steps:
                     self._come_back()
                 if doing:
                     self._operator.doing(doing)
-                self._tell(self._tried(step))
+                (tell or self._tell)(self._tried(step))
                 return
             except RestartedError as error:
                 self._all_restarts.append(error.restart)

@@ -152,6 +152,11 @@ def _fault_suffix(mcu: McuConfig, channel: Channel) -> str:
             return ""
 
 
+def stands(channel: Channel) -> bool:
+    """Return whether neither an encoder nor the operator has seen this motor turn."""
+    return channel.kind == "dead" and not channel.wheel
+
+
 def wheel_map(mcu: McuConfig, channels: Sequence[Channel]) -> Finding:
     """Return the finding that compares `[mcu.wheels]` with the wheels that the operator saw turn.
 

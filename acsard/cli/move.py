@@ -6,11 +6,13 @@ exit code is 1 if the robot does not follow, comes no nearer to the end for 3 s,
 from __future__ import annotations
 
 import argparse
+import sys
 
 from acsard.cli.common import add_speeds, between
 from acsard.cli.connection import add_bus, connected
 from acsard.client import Client
 from acsard.core.messages.short_texts import place
+from acsard.core.messages.state_warnings import WARNING, warnings
 from acsard.host.errors import UsageError
 
 # By the typed word: whether it is a turn, and the sign.
@@ -52,6 +54,8 @@ def main(args: argparse.Namespace) -> int:
 def _print_pose(robot: Client) -> None:
     pose = robot.pose()
     print("  ".join(place(pose.x, pose.y, pose.yaw)), flush=True)
+    for problem in warnings(robot.get("state")):
+        print(f"{WARNING}: {problem}", file=sys.stderr)
 
 
 def _parsed(words: list[str]) -> list[tuple[bool, float]]:

@@ -161,8 +161,13 @@ class TerminalPrompt(Prompt):
                 word = line.strip().lower()
                 if not line or word == QUIT_KEY:
                     raise KeyboardInterrupt
+                if len(names := word.split()) > 1:
+                    word = "".join(name[0] for name in names)  # "front right" is fr
+                near = [answer for answer in answers if answer.startswith(word)]
                 if word in answers:
                     return word
+                if len(near) == 1 < len(answers):
+                    return near[0]
                 self._print(f"   please type {' or '.join(answers)}; {QUIT_KEY} quits\n")
 
     def instruct(self, text: str) -> None:

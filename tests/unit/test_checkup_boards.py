@@ -86,6 +86,8 @@ BOARDS: dict[str, dict[str, tuple[str, dict[str, Any], bool]]] = {
         **{part: (f"plain_only {part}", {}, False)
            for part in ["reversed_motor=c", "stuck_encoder=b", "dead_motor=d",
                         "swapped_motors=a:b", "bias=c:0.93", "bias=c:0.7", "bias=b:3"]},
+        "no supply": (" ".join(["plain_only", *(f"dead_motor={m}" for m in "abcd")]), {}, False),
+        "two dead": ("plain_only dead_motor=a dead_motor=c", {}, False),
     },
     "motors_seen": {
         "plain": ("plain_only", {}, True),

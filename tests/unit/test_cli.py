@@ -12,6 +12,7 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
+from msgspec.structs import replace
 
 from acsard.cli import connection, foxglove, main, move, parser
 from acsard.cli.connection import Silence
@@ -26,6 +27,7 @@ from acsard.host.errors import (
     UsageError,
 )
 from tests.each import each
+from tests.unit.screens import STATE
 
 PROMISED = [
     (errors.UsageError, ValueError, 2),
@@ -176,17 +178,20 @@ def test_other_words_are_refused_with_an_example(words: str) -> None:
         _parsed(words.split())
 
 
-def test_an_interrupted_drive_prints_how_far_it_came(
+def test_an_interrupted_drive_prints_how_far_it_came_and_what_is_wrong(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     def driven(_: float, *, speed: float) -> None:
         raise KeyboardInterrupt
 
-    robot = SimpleNamespace(move=driven, pose=lambda: Pose(0.53, 0.0, 0.0))
+    state = replace(STATE, wheel_fault="the rear left wheel does not turn")
+    robot = SimpleNamespace(move=driven, pose=lambda: Pose(0.53, 0.0, 0.0), get=lambda _: state)
     monkeypatch.setattr(move, "connected", lambda *_: nullcontext())
     monkeypatch.setattr(move, "Client", lambda _: robot)
     assert main(["move", "forward", "1"]) == 130
-    assert "+0.530 m" in capsys.readouterr().out
+    out, err = capsys.readouterr()
+    assert "+0.530 m" in out
+    assert "WARNING: wheel fault: the rear left wheel does not turn" in err
 
 
 def test_without_its_library_it_says_which_extra_to_install(

@@ -129,6 +129,25 @@ def test_a_line_that_was_typed_before_the_question_does_not_answer_it(
     assert TerminalPrompt().ask("Which wheel did motor b turn?", ("fl", "rr")) == "rr"
 
 
+@pytest.mark.parametrize(
+    ("typed", "answers", "meant"),
+    [
+        ("Front right\n", ("fr", "fl", "none", "again"), "fr"),
+        ("n\n", ("fr", "fl", "none", "again"), "none"),
+        ("f\nfl\n", ("fr", "fl", "none", "again"), "fl"),  # "f" could be two of them
+        ("f\n", ("forward", "back"), "forward"),
+        ("\nb\n", ("forward", "back"), "back"),
+        ("l\nlifted\n", ("lifted",), "lifted"),  # the only answer is a confirmation: in full
+    ],
+)
+def test_an_answer_may_be_spoken_out_or_begun(
+    terminal: Terminal, monkeypatch: pytest.MonkeyPatch,
+    typed: str, answers: tuple[str, ...], meant: str,
+) -> None:  # fmt: skip
+    monkeypatch.setattr(termios, "tcflush", lambda *_: terminal.types(typed))
+    assert TerminalPrompt().ask("Which?", answers) == meant
+
+
 def test_nothing_but_enter_starts_a_leg(terminal: Terminal) -> None:
     terminal.answers("x ", "\n")
     with single_key_mode():

@@ -17,7 +17,7 @@ from acsard.core.messages.schema import (
     Twist,
     TwistStamped,
 )
-from acsard.core.messages.state_warnings import brief, charge, warnings
+from acsard.core.messages.state_warnings import WARNING, charge, warnings
 
 
 def place(x: float, y: float, yaw: float) -> list[str]:
@@ -58,7 +58,11 @@ def _state(state: RobotState) -> list[str]:
     why = printable(mode_and_reason(state))
     parts = [*place(state.x, state.y, state.yaw), *speeds(state.linear, state.angular), why]
     left = charge(state.battery)
-    return [*parts, *filter(None, (left and f"battery {left}", brief(warnings(state))))]
+    problems = "; ".join(map(str, warnings(state)))
+    return [
+        *parts,
+        *filter(None, (left and f"battery {left}", problems and f"{WARNING}: {problems}")),
+    ]
 
 
 def power(battery: BatterySummary) -> list[str]:
