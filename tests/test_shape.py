@@ -16,6 +16,8 @@ from itertools import pairwise
 from pathlib import Path
 from typing import get_args
 
+import pytest
+
 from acsard.core.values import EventName, Verb
 
 ROOT = Path(__file__).parents[1]
@@ -51,6 +53,12 @@ def code() -> dict[str, str]:
 @cache
 def nodes() -> dict[str, list[ast.AST]]:
     return {module: list(ast.walk(ast.parse(text, module))) for module, text in code().items()}
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _parsed() -> None:
+    """No single test pays for the parsing of all code."""
+    nodes()
 
 
 @cache
