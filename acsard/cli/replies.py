@@ -10,7 +10,7 @@ import msgspec
 from acsard.bus.robot_discovery import ALL_ROBOTS, count_text, running_robots
 from acsard.client.connection import Connection
 from acsard.core import formatting
-from acsard.core.formatting import printable
+from acsard.core.formatting import at_terminal, printable
 from acsard.core.messages.encodings import DecodeError, detect, encode
 from acsard.core.messages.schema import ServiceReply
 from acsard.core.values import AcsardError
@@ -77,7 +77,8 @@ def print_each(
         if isinstance(reply, AcsardError):
             reply = ServiceReply(False, silence.format(error=reply))
         line = encode(reply, "json").decode()
-        print(of_robot(robot_id, line) if as_json else printable(f"{robot_id}: {reply.message}"))
+        text = printable(f"{robot_id}: {at_terminal(reply.message)}")
+        print(of_robot(robot_id, line) if as_json else text)
     silent = [name for name, reply in replies.items() if isinstance(reply, AcsardError)]
     if ALL_ROBOTS in ids:
         answered = count_text(robot.where.endpoint, len(replies) - len(silent))
