@@ -39,6 +39,8 @@ FEW_COUNTS, FASTEST_HZ = 200, 100.0
 
 MIN_RATE_HZ = 0.1  # publishing, if not 0
 
+LARGEST_M = {"wheel_radius": 0.5, "wheel_separation": 3.0}  # more was measured in cm
+
 MAX_VOLTS = 99.99  # in a status line
 
 
@@ -62,6 +64,12 @@ def warnings(config: Config) -> list[str]:
             "table, or leave the key out to get the default sources"
         )
     drive, limits = config.drive, config.limits
+    for key, most in LARGEST_M.items():
+        if (metres := getattr(drive, key)) > most:
+            messages.append(
+                f"drive.{key} = {metres:g}: the unit is metres; if you measured {metres:g} cm, "
+                f"write {metres / 100:g}"
+            )
     needed = limits.linear_speed / drive.wheel_radius
     if needed > limits.wheel_speed:
         messages.append(

@@ -60,7 +60,10 @@ def _table(text: bytes) -> dict[str, Any]:
         raise ConfigError([f"not UTF-8 text: {error}; save the file as UTF-8"]) from None
     except tomllib.TOMLDecodeError as error:
         raise ConfigError(
-            [f"not TOML: {error}; write texts in quotes, but true and false without quotes"]
+            [
+                f"not TOML: {error}; write texts in quotes, but true and false without quotes, and "
+                "numbers with a decimal point and no unit: 0.05"
+            ]
         ) from None
     # Python limits the length of numbers and the depth of nesting.
     except (ValueError, RecursionError):
