@@ -10,15 +10,19 @@ import faulthandler
 import os
 import shlex
 import sys
+from contextlib import suppress
 from importlib.util import find_spec
 from pathlib import Path
 
+from acsard.bus.address import address_of
 from acsard.bus.zenoh_sessions import reachable
 from acsard.cli.common import add_config, add_port, load, with_record_directory
+from acsard.client.connection import open_connection
 from acsard.core.config.contradictions import warnings
 from acsard.core.config.settings import Config
-from acsard.core.values import ROOT_KEY, Event
+from acsard.core.values import ROOT_KEY, AcsardError, Event
 from acsard.daemon import daemon
+from acsard.host.errors import InUseError
 from acsard.host.event_loop import EventLoop
 from acsard.host.logs import Log, Writer
 from acsard.host.version import version
@@ -134,10 +138,26 @@ def main(args: argparse.Namespace) -> int:
                     served,
                 )
             )
+    except InUseError as error:
+        raise InUseError(_owner(config) or str(error)) from error
     finally:
         log.close()
         screen.close(0.2)
     return 0
+
+
+def _owner(config: Config) -> str:
+    # Says which daemon already runs, if one answers at the address of this one.
+    address = address_of(config)
+    with suppress(AcsardError), open_connection(address) as robot:
+        pid = robot.get("info").pid
+        return (
+            f"acsard already runs: the process {pid} answers at {address.endpoint} as robot "
+            f"{address.robot_id}. Use it, or end it: `kill {pid}`, or `sudo systemctl stop acsard` "
+            "if it is the service. For a second daemon, choose another address with --listen or in "
+            "bus.listen"
+        )
+    return ""
 
 
 def page(config: Config, where: str) -> list[str] | None:

@@ -126,7 +126,7 @@ def test_a_second_daemon_on_the_bus_address_ends_with_75_before_a_byte_on_its_ow
         assert first.process.poll() is None
     print(f"second daemon on the address: exit {second.code} after {second.seconds:.2f} s")
     assert second.code == 75
-    assert first.endpoint in second.err
+    assert f"the process {first.pid} answers at {first.endpoint} as robot acsar" in second.err
     assert "with --listen or in bus.listen" in second.err
     assert "Traceback" not in second.err
     assert peer.session.stream == b""
