@@ -132,6 +132,6 @@ def summary(result: CheckupReport, where: str) -> str:
         rest = "nothing to change"
         if not _complete(result.findings):
             rest = "no suggestion, because the check did not judge every step"
-        return f"\n{counts}\nacsard.toml: {rest}"
+        return f"\n{counts}\n{where}: {rest}"
     head = f"{where}: written" if result.written else "for acsard.toml:"
     return f"\n{counts}\n\n{head}\n{result.toml}"

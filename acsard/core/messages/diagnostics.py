@@ -64,6 +64,8 @@ SIMULATOR_ADVICE = (
     "to drive a robot, set mcu.port to the board's serial port; `acsard ports` lists the ports"
 )
 
+PORT_ADVICE = "plug the board in if it is not; `acsard ports` lists the serial ports"
+
 CLEAR = "then look at the robot, and type `acsard call clear`"
 
 DEFECT = (
@@ -189,6 +191,8 @@ def _link(config: Config, snapshot: Snapshot) -> Iterator[Finding]:
     status, counters, simulated = snapshot.status, snapshot.counters, config.mcu.simulated
     by_host = simulated or status.code in HOST_CODES
     advice = BUSY_ADVICE if by_host else _check(config)
+    if status.link == "down" and not simulated:
+        advice = PORT_ADVICE
     if status.link == "up":
         yield OK, "up", ""
     else:
