@@ -63,15 +63,15 @@ def packages(out: Path, tools: Path) -> list[Path]:
             venv.create(tools, with_pip=True)
             _run(python, "-m", "pip", "install", "-q", "-r", str(RELEASE / "requirements.lock"))
         with tempfile.TemporaryDirectory() as work:
-            wheel = _wheel(Path(work))
+            wheel = _wheel(python, Path(work))
             made = Path(tempfile.mkdtemp(dir=out.parent))
             _run(python, str(RELEASE / "debian.py"), str(wheel), str(made))
             made.rename(out)
     return sorted(out.glob("*.deb"))
 
 
-def _wheel(work: Path) -> Path:
-    # Of the files that git tracks, because others are not in a release.
+def _wheel(python: str, work: Path) -> Path:
+    # Of the files that git tracks, because others are not in a release. The tools add the manual.
     git = ["git", "-c", "safe.directory=*", "ls-files", "-z", "--cached", "--others"]
     listed = subprocess.run(
         [*git, "--exclude-standard"], cwd=ROOT, capture_output=True, text=True, check=True
@@ -83,7 +83,8 @@ def _wheel(work: Path) -> Path:
     init = work / "acsard" / "__init__.py"
     text, _, _ = init.read_text().rpartition("__version__")
     init.write_text(f'{text}__version__ = "{NUMBER}"\n')
-    _run(sys.executable, "-m", "pip", "wheel", "-q", "--no-deps", "-w", str(work), str(work))
+    words = ("-m", "build", "--no-isolation", "--wheel", "--outdir", str(work), str(work))
+    _run(python, *words)
     return next(work.glob("*.whl"))
 
 

@@ -224,6 +224,10 @@ def test_the_same_source_gives_the_same_bytes(
         assert one.read_bytes() == other.read_bytes(), one.name
 
 
+MANUAL = ("python3", "-c", "import urllib.request as url; "
+          "print(url.urlopen('http://127.0.0.1:8080/docs').read().decode())")  # fmt: skip
+
+
 def _two_packages(bare: Root, made: list[Path]) -> tuple[Path, Path]:
     """Give a root systemd and two packages of different versions, the older first."""
     bare.run("apt-get install --yes --no-install-recommends systemd-sysv dbus udev python3")
@@ -246,6 +250,7 @@ def test_the_first_installation_starts_the_service_and_no_upgrade_restarts_it(
                 assert container.show("ActiveState", unit) == "active", container.messages(unit)
             status = container.run("acsard", "service", "status")
             assert (status.code, "missing" in status.out) == (0, False), status.out
+            until(lambda: "The manual of acsard" in container.run(*MANUAL).out, 20.0, "a manual")
             refused = container.run("acsard", "service", "uninstall", "--purge")
             assert (refused.code, "sudo apt remove acsard" in refused.err) == (1, True)
             assert container.show("ActiveState") == "active"
