@@ -212,10 +212,10 @@ def main_renew(args: argparse.Namespace) -> int:
         place = certificates.renew_client(args.directory, args.name, args.address, args.days)
         files = ", ".join((CA, CERTIFICATE, KEY))
         print(f"{place} has a new certificate. Copy {files} from there over the old files.\n")
-        print(COMMAND_NAMES_WARNING)
+        print(_RENEWED_CLIENT)
         return 0
     print(_certified(certificates.renew(args.directory, args.address, args.days)))
-    print(f"{args.directory / CERTIFICATE} is the new certificate.\n\n{COMMAND_NAMES_WARNING}")
+    print(f"{args.directory / CERTIFICATE} is the new certificate.\n\n{_RENEWED_ROBOT}")
     return 0
 
 
@@ -274,19 +274,22 @@ and keep the names that are already in the list. The lines below include the nam
 leave the lines out, because router.json5 has the roles.
 """
 
-COMMAND_NAMES_WARNING = """\
-`acsard router`, `acsard web` and the gateway of `acsard run` use the new certificate within 5 s by
-themselves. For this, the gateway and the router disconnect their clients for about a second. If one
-of these clients drives a robot, the robot ramps to zero. If you started `acsard gateway` by hand,
-it ends with code 1: start it again. A robot that connects to a router uses the new certificate when
-it connects the next time. Until then, `acsard doctor` warns about the old certificate; a restart of
-`acsard run` ends the warning immediately.
+_RENEWED_ROBOT = """\
+`acsard web` and the gateway of `acsard run` use the new certificate within 5 s by themselves. For
+this, the gateway disconnects its clients for about a second: a robot that one of them drives ramps
+to zero. If you started `acsard gateway` by hand, it ends with code 1: start it again.
 
-A systemd service has copies of the files. To renew the copies, run these commands on the machine
-of the service. The robot keeps driving meanwhile:
+A systemd service has copies of the files. Renew them on the robot; it keeps driving meanwhile:
 
   sudo systemctl try-reload-or-restart acsard-gateway acsard-web
-  sudo systemctl reload acsard     if the robot connects to a router
+"""
+
+_RENEWED_CLIENT = """\
+A tool uses the new certificate when it starts next.
+A robot that connects to a router uses it for its next connection. For a service type there
+`sudo systemctl reload acsard`; the robot keeps driving.
+`acsard router` and `zenohd` keep the old certificate until you restart them:
+`sudo systemctl restart acsard-router`; driven robots ramp to zero.
 """
 
 _LINES = """\
