@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import random
+from itertools import cycle, islice
+from time import process_time_ns
+
 from acsard.core.config.settings import McuConfig
-from acsard.core.link.lines import LineReader
+from acsard.core.link.lines import MAX_LINE_BYTES, LineReader
 from acsard.core.link.link_diagnosis import (
     FIRST_DIAGNOSIS_NS,
     MAX_UNANSWERED_FRACTION,
@@ -60,6 +64,31 @@ def test_the_diagnosis_says_what_was_received_and_how_it_looks(
     assert heard.code == heard.diagnosis().code == f"received_{looks}"
     assert counted in heard.counted
     assert heard.counted in heard.diagnosis().text
+
+
+def test_no_line_that_the_board_can_send_takes_long_to_classify() -> None:
+    """The control loop classifies the lines: one that takes long would stop the wheels."""
+
+    def cost(line: bytes) -> int:
+        def once() -> int:
+            start = process_time_ns()
+            for _ in range(5):
+                Heard().line(line, good=False)
+            return process_time_ns() - start
+
+        return min(once() for _ in range(3))
+
+    most = MAX_LINE_BYTES - 1
+    plain = cost(b"x" * most)
+    dice = random.Random(1)
+    for size in islice(cycle(range(16, most)), 1500):
+        part, rest = divmod(size - 1, 4)
+        pattern = dice.choices([b" ", b"1", b".1", b"p", b"= ", b",", b""], k=4)
+        run = dice.choice([b"1", b" ", b"1 ", b"=", b","]) * part
+        groups = (bytes([wheel]) + (pattern[0] + run + b"".join(pattern[1:])) for wheel in b"abcd")
+        spaced = (bytes([wheel]) + b" " * (part // 2) + b"1" * (part // 2) for wheel in b"abcd")
+        for line in (b"".join(groups) + b"x" * rest, b"".join(spaced) + b"x"):
+            assert cost(line[:most]) < 20 * plain, line[:most]
 
 
 def test_it_comes_after_three_seconds_and_again_only_when_it_changes() -> None:

@@ -44,7 +44,10 @@ ReceivedCode = Literal[
 CHECKED_FIRMWARE = ', does its firmware support mcu.link_check = "on" (else write "off")'
 
 _RIGHT = re.compile(TOKENS)
-_OTHER_FORM = re.compile(rb"[abcd][: =]*[pn+-]? *[0-9]*\.?[0-9]+[,; \t]*" * 4, re.IGNORECASE)
+# Each byte has one place in it, so that no line makes the search for a match long.
+_OTHER_FORM = re.compile(
+    rb"[abcd][: =]*(?:[pn+-] *)?(?:[0-9]+(?:\.[0-9]+)?|\.[0-9]+)[,; \t]*" * 4, re.IGNORECASE
+)
 _WORD = re.compile(rb"[A-Za-z]{3}")
 _VALUE = re.compile(rb"(?<![A-Za-z])[abcd][pn] *[0-9]+\.[0-9]")
 # Only characters that a reply can contain.
