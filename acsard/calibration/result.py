@@ -12,7 +12,7 @@ import numpy as np
 from msgspec import Struct
 from rich.console import RenderableType
 
-from acsard.calibration.checks import DRIVE, require_agreement, require_motion
+from acsard.calibration.checks import require_agreement, require_motion
 from acsard.calibration.fit import LEFT, RIGHT, TRACK, Errors, Fit, fit
 from acsard.calibration.log import Log, LogError
 from acsard.calibration.noise import Noise, noise
@@ -92,8 +92,8 @@ def _result(log: Log, config: Config, source: str, found: Fit, notes: list[str])
     decisions += _noise(found, config, settings, shown)
     decisions += _response(log, config, settings)
     if not settings:
-        raise LogError(" ".join(decisions) + " Nothing is written. On a robot that is calibrated "
-                       f"this is right; on another one record a longer drive: {DRIVE}")  # fmt: skip
+        agrees = "Your robot agrees with its configuration: nothing to write."
+        raise LogError("\n".join([agrees, *decisions]))
     return Result(
         source, " and ".join(found.sensors), len(log.runs), sum(r.seconds for r in log.runs),
         sum(float(np.abs(d).sum()) for d, _ in motion),

@@ -7,6 +7,7 @@ from __future__ import annotations
 import argparse
 import math
 import sys
+import textwrap
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -184,7 +185,10 @@ def _finished(
         if args.json:
             print(msgspec.json.encode(Refusal(source, str(error), notes)).decode(), flush=True)
         notes_text = "".join(f"\nnote: {note}" for note in notes)
-        raise MendableError(f"{source}: {error}{notes_text}") from None
+        paragraphs = f"{source}: {error}{notes_text}".splitlines()
+        fill = textwrap.TextWrapper(MAX_TEXT_WIDTH, break_long_words=False).fill
+        wrapped = [fill(paragraph) for paragraph in paragraphs]
+        raise MendableError("\n".join(wrapped)) from None
     trouble = None
     if args.write:
         try:

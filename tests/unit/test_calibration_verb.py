@@ -14,6 +14,7 @@ from acsard.cli import parser
 from acsard.core.config.parsing import parse
 from acsard.host.errors import Exit, MendableError, UnreachableError
 from acsard.terminal import prompt
+from acsard.terminal.output import MAX_TEXT_WIDTH
 from tests.unit.calibration_logs import usual
 
 GOOD = usual().csv(places=False)
@@ -69,9 +70,10 @@ def test_write_keeps_the_comments_and_a_second_time_finds_nothing_to_improve(
     for key, value in result["settings"].items():
         section, _, name = key.partition(".")
         assert getattr(getattr(config, section), name) == value
-    with pytest.raises(MendableError, match="not clearly better") as end:
+    with pytest.raises(MendableError, match="agrees with its configuration: nothing") as end:
         called(tmp_path, GOOD, "--json", "--write", text=text)
     assert end.value.code == Exit.FAILURE
+    assert max(map(len, str(end.value).splitlines())) <= MAX_TEXT_WIDTH
     assert (tmp_path / "acsard.toml").read_text() == text
 
 
