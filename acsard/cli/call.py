@@ -6,16 +6,17 @@ from __future__ import annotations
 
 import argparse
 import math
+import sys
 from collections.abc import Sequence
 
 from acsard.bus import robot_discovery
 from acsard.cli.connection import SEVERAL_IDS, add_bus, connected_to_many, several_ids
 from acsard.cli.replies import of_each, print_each
 from acsard.client.connection import Connection
-from acsard.core.formatting import at_terminal, json_line, lines
+from acsard.core.formatting import at_terminal, json_line, lines, printable
 from acsard.core.messages.encodings import encode
 from acsard.core.messages.keys_and_roles import SERVICES
-from acsard.core.messages.schema import MESSAGES
+from acsard.core.messages.schema import MESSAGES, ServiceReply
 from acsard.host.errors import UsageError
 
 # The service `set` is `acsard set`.
@@ -115,4 +116,13 @@ def _stop_all(robot: Connection, ids: tuple[str, ...], *, as_json: bool) -> int:
     robot_discovery.stop(robot.session, ids, robot.caller)
     replies = of_each(robot, ids, lambda client: client.call("stop"))
     silence = "NO ANSWER: go to the robot, or use its emergency switch ({error})"
-    return print_each(replies, robot, ids, silence, as_json=as_json)
+    code = print_each(replies, robot, ids, silence, as_json=as_json)
+    moving = [
+        name
+        for name, reply in replies.items()
+        if not (isinstance(reply, ServiceReply) and reply.success)
+    ]
+    if moving:
+        advice = "go to them; repeat the stop until every line says `stopped`"
+        print(f"acsard: NOT STOPPED: {printable(', '.join(moving))}: {advice}", file=sys.stderr)
+    return code
