@@ -10,7 +10,7 @@ import asyncio
 import re
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING
 
 from acsard.bus.address import address_of
@@ -115,18 +115,32 @@ def _loaded(args: argparse.Namespace) -> tuple[str, Config]:
     return where, with_record_directory(config)
 
 
+def places(
+    addresses: Sequence[Listen], listen: Sequence[Listen], tls: str, *, with_manual: bool
+) -> Iterator[str]:
+    """Yield a line for each URL of the page at these addresses, and one for the manual."""
+    from acsard.web.listen import page_urls
+
+    first = ""
+    for address, wished in zip(addresses, listen, strict=True):
+        instead = f"  (instead of {wished.url}, at which acsard cannot listen)"
+        note = "" if address == wished else instead
+        for url in page_urls(address, tls):
+            first = first or url
+            yield f"page    {url}{note}"
+    if with_manual:
+        yield f"manual  {first}docs"
+
+
 def main(args: argparse.Namespace) -> int:
     _, config = _loaded(args)
     from acsard.web import server, tokens
-    from acsard.web.listen import page_urls
+    from acsard.web.manual import MANUAL
 
     def announce(addresses: Sequence[Listen]) -> None:
-        for address, wished in zip(addresses, listen, strict=True):
-            instead = f"  (instead of {wished.url}, at which acsard cannot listen)"
-            note = "" if address == wished else instead
-            for url in page_urls(address, tls):
-                # Write the line as one text, so that no line of the log is printed inside it.
-                sys.stdout.write(f"  page    {url}{note}\n")
+        # Write each line as one text, so that no line of the log is printed inside it.
+        for line in places(addresses, listen, tls, with_manual=MANUAL.is_file()):
+            sys.stdout.write(f"  {line}\n")
 
     tls = args.tls or config.bus.tls
     listen = _listen(args, config)

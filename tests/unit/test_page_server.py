@@ -89,6 +89,16 @@ def test_the_reported_addresses_of_the_page_are_those_of_an_invitation(tls: str)
     assert page_urls(here, "") == ["http://127.0.0.1:8080/"]
 
 
+def test_the_lines_at_the_start_name_each_page_and_the_manual_that_it_serves() -> None:
+    wished, other = Listen(False, "127.0.0.1", 8080), Listen(False, "127.0.0.1", 8081)
+    assert list(web.places([wished], [wished], "", with_manual=False)) == [
+        "page    http://127.0.0.1:8080/"
+    ]
+    page, manual = web.places([other], [wished], "", with_manual=True)
+    assert page.startswith("page    http://127.0.0.1:8081/  (instead of http://127.0.0.1:8080/")
+    assert manual == "manual  http://127.0.0.1:8081/docs"
+
+
 @pytest.mark.parametrize(("host", "by"), [("0.0.0.0", {"127.0.0.1"}), ("::", {"127.0.0.1", "::1"})])
 def test_a_wildcard_address_is_reached_by_ipv4_and_only_the_ipv6_one_by_ipv6(
     host: str, by: set[str]
