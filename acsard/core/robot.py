@@ -542,7 +542,7 @@ class Robot:
     def _release_port(self, by: str, now: Instant) -> tuple[str, tuple[int, ...]]:
         if self.config.mcu.simulated:
             raise RefusedError("the built-in simulator has no serial port")
-        if self._life.shutting_down or not self._at_rest:
+        if not self._at_rest:
             raise RefusedError("the port is released only while the robot rests")
         numbers: tuple[int, ...] = ()
         if self._life.mode not in (Mode.STOPPED, Mode.FAULT, Mode.INACTIVE):
