@@ -294,8 +294,8 @@ def trouble(endpoint: str, directory: str) -> str:
                 "this network, is the address right?"
             )
         return (
-            f"no program listens on port {port} of {host} ({error}); does bus.listen in the "
-            "robot's acsard.toml contain this address?"
+            f"no program listens on port {port} of {host} ({error}); if a router should: is it "
+            "running? If a robot should: does bus.listen in its acsard.toml contain this address?"
         )
     with plain:
         return _tls_trouble(plain, host, directory)

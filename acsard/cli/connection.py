@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 
 import zenoh
 
@@ -18,7 +18,7 @@ from acsard.client.follower import FIRST_STATE_TIMEOUT_S
 from acsard.core.config.settings import TLS_PREFIX
 from acsard.core.formatting import printable
 from acsard.core.messages.keys_and_roles import key_hint, row_of, unknown
-from acsard.host.errors import UsageError
+from acsard.host.errors import UnreachableError, UsageError
 
 SEVERAL_IDS = "; several ids separated by commas, or '*' for all robots"
 
@@ -82,7 +82,19 @@ def connected_to_many(args: argparse.Namespace) -> Iterator[tuple[Connection, tu
     if ALL_ROBOTS in many:
         many += config.fleet.robots
     where = address_of(config, args.connect, None if many else args.id, args.tls)
-    with open_connection(where) as robot:
+    with ExitStack() as stack:
+        try:
+            robot = stack.enter_context(open_connection(where))
+        except UnreachableError as error:
+            named = [robot_id for robot_id in many if robot_id != ALL_ROBOTS]
+            if not named:
+                raise
+            stops = getattr(args, "service", "") == "stop"
+            fate, advice = ("STOPPED", ": go to them") if stops else ("REACHED", "")
+            raise UnreachableError(
+                f"NO ROBOT WAS {fate}: {', '.join(named)}{advice}. Is the router running (on its "
+                f"machine: `systemctl status acsard-router`)? {error}"
+            ) from None
         yield robot, many
 
 

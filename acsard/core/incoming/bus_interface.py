@@ -150,4 +150,7 @@ class RouterFollower:
             events.append(Event("not_a_router", text, "warning"))
 
 
-TRIED_AGAIN = "the daemon tries again until it connects, and the robot can drive meanwhile"
+TRIED_AGAIN = (
+    "the daemon tries again until it connects. Meanwhile, in mode `client` the robot ramps to zero "
+    "and waits, and in mode `peer` programs on the robot can drive it"
+)
