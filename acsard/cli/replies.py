@@ -14,7 +14,7 @@ from acsard.core.formatting import at_terminal, printable
 from acsard.core.messages.encodings import DecodeError, detect, encode
 from acsard.core.messages.schema import ServiceReply
 from acsard.core.values import AcsardError
-from acsard.host.errors import Exit
+from acsard.host.errors import Exit, NotPermittedError
 
 
 def of_robot(whose: str, line: str) -> str:
@@ -34,6 +34,8 @@ def json_line(encoding: str, payload: bytes) -> str:
     except (DecodeError, msgspec.MsgspecError, ValueError, TypeError, RecursionError):
         return msgspec.json.encode({"undecodable": repr(payload)}).decode()
 
+
+BARRED = "NOT ALLOWED: {error}"
 
 # Replies by robot id; an error says why there is no reply.
 Replies = Mapping[str, ServiceReply | AcsardError]
@@ -70,21 +72,26 @@ def print_each(
 ) -> int:
     """Print a line for each reply, and return the exit code.
 
-    It is `UNREACHABLE` if a robot did not answer, otherwise `FAILURE` if one refused. `silence` is
-    the text for a robot without an answer, for the reason `{error}`.
+    It is `UNREACHABLE` if a robot did not answer, otherwise `NO_PERMISSION` if this client may not
+    call one, otherwise `FAILURE` if one refused. `silence` is the text for a robot without an
+    answer, for the reason `{error}`.
     """
     for robot_id, reply in replies.items():
         if isinstance(reply, AcsardError):
-            reply = ServiceReply(False, silence.format(error=reply))
+            barred = isinstance(reply, NotPermittedError)
+            reply = ServiceReply(False, (BARRED if barred else silence).format(error=reply))
         line = encode(reply, "json").decode()
         text = printable(f"{robot_id}: {at_terminal(reply.message)}")
         print(of_robot(robot_id, line) if as_json else text)
-    silent = [name for name, reply in replies.items() if isinstance(reply, AcsardError)]
+    failed = {name: reply for name, reply in replies.items() if isinstance(reply, AcsardError)}
+    silent = [name for name, error in failed.items() if not isinstance(error, NotPermittedError)]
     if ALL_ROBOTS in ids:
         answered = count_text(robot.where.endpoint, len(replies) - len(silent))
         without = f"; without an answer: {', '.join(silent)}" if silent else ""
         print(f"acsard: {printable(answered + without)}", file=sys.stderr)
     if silent:
         return Exit.UNREACHABLE
+    if failed:
+        return Exit.NO_PERMISSION
     done = [isinstance(reply, ServiceReply) and reply.success for reply in replies.values()]
     return Exit.OK if all(done) else Exit.FAILURE

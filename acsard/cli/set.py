@@ -6,7 +6,7 @@ cannot write a source's timeout: edit [[commands.sources]] in the file. A robot 
 than a new limit slows down to it.
 Without a setting, list the settings that can be changed. If --id names several robots, all of them
 get the settings at the same time, and each line has the answer of one robot. The exit code is 1 if
-a robot refuses, and 69 if a robot does not answer.
+a robot refuses, 77 if your role may not, and 69 if a robot does not answer.
 """
 
 from __future__ import annotations

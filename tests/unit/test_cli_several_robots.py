@@ -1,0 +1,58 @@
+"""What the tools say of several robots, when some or all of them cannot be reached."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import cast
+
+import pytest
+
+from acsard.cli.replies import Replies, print_each
+from acsard.client.connection import Connection
+from acsard.core.messages.schema import ServiceReply
+from acsard.host.errors import Exit, NoAnswerError, NotPermittedError
+from tests.system.harness import free_endpoint
+from tests.system.typed import typed
+
+DONE, REFUSED = ServiceReply(True, "done"), ServiceReply(False, "refused")
+SILENT, BARRED = NoAnswerError("nobody"), NotPermittedError("role operator")
+
+
+@pytest.mark.parametrize(
+    ("replies", "code"),
+    [
+        ({"a": DONE}, Exit.OK),
+        ({"a": DONE, "b": REFUSED}, Exit.FAILURE),
+        ({"a": REFUSED, "b": BARRED}, Exit.NO_PERMISSION),
+        ({"a": BARRED, "b": SILENT}, Exit.UNREACHABLE),
+    ],
+)
+def test_a_refused_permission_is_no_silence(
+    replies: Replies, code: Exit, capsys: pytest.CaptureFixture[str]
+) -> None:
+    robot = cast("Connection", None)
+    assert print_each(replies, robot, [*replies], "NO ANSWER: {error}", as_json=False) == code
+    lines = capsys.readouterr().out.splitlines()
+    assert ("b: NOT ALLOWED: role operator" in lines) == (replies.get("b") is BARRED)
+    assert ("b: NO ANSWER: nobody" in lines) == (replies.get("b") is SILENT)
+
+
+@pytest.mark.parametrize(
+    ("words", "begin"),
+    [
+        (
+            ("call", "stop", "--id", "*"),
+            "acsard: NO ROBOT WAS STOPPED: robot1, robot2: go to them. Is",
+        ),
+        (("fleet", "--once"), "acsard: NO ROBOT WAS REACHED: robot1, robot2. Is the router"),
+    ],
+)
+def test_without_the_router_every_expected_robot_is_named(
+    words: tuple[str, ...], begin: str, tmp_path: Path
+) -> None:
+    config = tmp_path / "acsard.toml"
+    config.write_text('[fleet]\nrobots = ["robot1", "robot2"]\n')
+    ended = typed(*words, "--config", str(config), "--connect", free_endpoint())
+    assert ended.code == Exit.UNREACHABLE
+    assert ended.err.startswith(begin)
+    assert "systemctl status acsard-router" in ended.err
