@@ -43,6 +43,11 @@ def denial(path: str) -> tuple[str, str]:
         return text, f"`ls -l {path}` and `getfacl {path}` show more; is this a container?"
     if _is_member(group):
         return f"{text}; you are in it, but this session is older", "log out and in again"
+    if status.st_gid in (0, TTY_GROUP):  # whoever is in it may do much more
+        return text, (
+            f"run `sudo chown root:dialout {path}`, and let the udev rule of this device (as in "
+            'deploy/udev/70-acsar.rules) set GROUP="dialout"'
+        )
     return (
         f"{text}, but you are not in it",
         f"run `sudo usermod -aG {group} $USER`, then log in again (the systemd service does not "

@@ -29,6 +29,7 @@ from acsard.daemon.serial.device import (
 )
 from acsard.host import clock
 from acsard.host.errors import Exit, InUseError
+from acsard.host.port_access import denial
 from tests.each import each
 
 
@@ -99,6 +100,22 @@ def test_a_device_without_permission_is_named_with_what_is_really_so(
         getty.kill()
     assert refused.code is Exit.NO_PERMISSION
     assert words in str(refused)
+
+
+@pytest.mark.skipif(os.getuid() != 0, reason="only root gives a file to any group")
+@each("group", [0, 5])
+def test_a_device_of_root_or_of_the_terminals_gets_another_group(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, group: int
+) -> None:
+    path = tmp_path / "ttyUSB0"
+    path.touch()
+    os.chown(path, 0, group)
+    path.chmod(0o660)
+    monkeypatch.setattr(os, "getgid", lambda: 54321)
+    monkeypatch.setattr(os, "getgroups", list)
+    advice = denial(str(path))[1]
+    assert advice.startswith(f"run `sudo chown root:dialout {path}`")
+    assert "usermod" not in advice
 
 
 def test_an_empty_read_is_not_a_hang_up_and_a_hang_up_is_reported() -> None:
