@@ -10,11 +10,13 @@ import os
 import re
 import subprocess
 from collections.abc import Iterator, Sequence
+from itertools import pairwise
 from pathlib import Path
 
 from msgspec import Struct
 
 from acsard.core.values import Ns
+from acsard.host.config_file import SEARCH_PATHS
 
 PROC = Path("/proc")
 
@@ -96,6 +98,25 @@ def is_daemon_here(pid: int) -> bool:
     """
     command = _text(PROC / str(pid) / "cmdline").split("\0")
     return _executed(command) == "acsard" and "run" in command
+
+
+def config_of(pid: int) -> Path | None:
+    """Return the configuration file that a daemon found when it started; None if unknown.
+
+    Only the daemon's user and root may ask.
+    """
+    process = PROC / str(pid)
+    try:
+        start = Path(os.readlink(process / "cwd"))
+    except OSError:
+        return None
+    words, variables = (_text(process / name).split("\0") for name in ("cmdline", "environ"))
+    named = [word.partition("=")[2] for word in words if word.startswith("--config=")]
+    named += [after for word, after in pairwise(words) if word == "--config"]
+    named += [one.partition("=")[2] for one in variables if one.startswith("ACSARD_CONFIG=")]
+    found = [start / place for place in filter(None, named)]
+    found += [start / place for place in SEARCH_PATHS if (start / place).is_file()]
+    return found[0] if found else None
 
 
 def waited_ns(pid: int) -> Ns:

@@ -15,7 +15,7 @@ from acsard.core.messages.schema import ServiceReply
 from acsard.core.values import Plain
 from acsard.host.config_file import change, writable
 from acsard.host.errors import MendableError, UsageError
-from acsard.host.processes import is_daemon_here
+from acsard.host.processes import config_of, is_daemon_here
 
 
 def can_be_kept(key: str) -> bool:
@@ -37,7 +37,8 @@ def set_and_keep(
             "all of these tables from the output of `acsard check` first, because the file's "
             "tables replace all built-in ones"
         )
-    if not is_daemon_here(robot.get("info").pid):
+    pid = robot.get("info").pid
+    if not is_daemon_here(pid):
         raise MendableError(
             "no setting was changed: only a program on the robot can write its file, but the "
             "daemon runs on another machine or in a container: type `acsard set --keep` there"
@@ -50,4 +51,7 @@ def set_and_keep(
         change(file, settings)
     except MendableError as error:
         raise MendableError(f"{reply.message}; not written: {error}") from None
-    return replace(reply, message=f"{reply.message}; written to {file}")
+    text, used = f"{reply.message}; written to {file}", config_of(pid)
+    if used is not None and used.resolve() != file.resolve():
+        text += f", but the daemon uses {used}: start it with `--config {file}`"
+    return replace(reply, message=text)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import tomllib
 from pathlib import Path
+from tempfile import mkdtemp
 
 import pytest
 
@@ -86,6 +87,34 @@ def test_keep_writes_the_file_of_the_robot_on_which_it_is_typed(
     assert capsys.readouterr().out == f"rates.telemetry = 5.0 (was 10.0); written to {file}\n"
     assert "# mine\n" in file.read_text()
     assert tomllib.loads(file.read_text()) == {"rates": {"telemetry": 5}}
+
+
+@each("started", ["--config", "--config=", "ACSARD_CONFIG", "./acsard.toml"])
+@each("same", [True, False])
+def test_keep_says_that_the_daemon_uses_another_file(
+    started: str,
+    same: bool,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    tmp_path: Path,
+) -> None:
+    where = Path(mkdtemp(dir=tmp_path))
+    used, other, process = (where / name for name in ("acsard.toml", "robot2.toml", "1"))
+    used.touch()
+    other.touch()
+    process.mkdir()
+    (process / "cwd").symlink_to(where)
+    words = {"--config": ("--config", "acsard.toml"), "--config=": ("--config=acsard.toml",)}
+    command = ("/bin/acsard", "run", *words.get(started, ()))
+    (process / "cmdline").write_text("\0".join(command))
+    variable = "ACSARD_CONFIG=acsard.toml" if started == "ACSARD_CONFIG" else ""
+    (process / "environ").write_text(f"HOME=/\0{variable}\0")
+    monkeypatch.setattr("acsard.host.processes.PROC", where)
+    monkeypatch.setattr("acsard.cli.connection.open_connection", lambda *words, **more: Robot())
+    file = used if same else other
+    assert main(["set", "rates.telemetry", "5", "--keep", "--config", str(file)]) == 0
+    advice = f", but the daemon uses {used}: start it with `--config {other}`\n"
+    assert capsys.readouterr().out.partition(f"written to {file}")[2] == ("\n" if same else advice)
 
 
 @each("why", ["another machine", "it is read-only", "no configuration file"])
