@@ -548,7 +548,7 @@ class Robot:
         if self._life.mode not in (Mode.STOPPED, Mode.FAULT, Mode.INACTIVE):
             self._life.deactivate(by, now)
             numbers = (self._life.latches.last,)
-        self.port_released = True
+        self.port_released = self._odometry.was_lent = True
         return "the serial port is closed; call srv/activate to open it again", numbers
 
     @property

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import pytest
 
 from acsard.core.config.settings import Config, McuConfig, OdometryConfig
@@ -63,6 +65,25 @@ def test_the_port_is_released_at_rest_and_a_robot_that_was_off_stays_off(
     assert (rig.robot.port_released, rig.mode) == (True, mode if before else "inactive")
     rig.asked(Request("activate", 2, numbers=answer.numbers))
     assert (rig.robot.port_released, rig.mode) == (False, mode)
+
+
+def test_a_pose_is_as_uncertain_as_the_robot_may_have_been_driven_while_the_port_was_lent() -> None:
+    rig = Rig(REAL).linked()
+    rig.run(100)
+    before = rig.out.estimates[-1].covariance
+    (answer,) = rig.asked(Request("deactivate", 1, release_port=True)).answers
+    rig.unplug().step(ms=10_000)
+    rig.replug().asked(Request("activate", 2, numbers=answer.numbers))
+    after = rig.linked().out.estimates[-1].covariance
+    limits = REAL.limits
+    for was, now, speed in [
+        (before.xx, after.xx, limits.linear_speed),
+        (before.yy, after.yy, limits.linear_speed),
+        (before.yawyaw, after.yawyaw, limits.angular_speed),
+    ]:
+        assert math.sqrt(now - was) == pytest.approx(10.0 * speed, rel=0.02)
+    rig.unplug().step(ms=10_000)
+    assert rig.replug().linked().out.estimates[-1].covariance == after, "nobody else had it"
 
 
 def test_neither_a_moving_robot_nor_the_simulator_built_in_releases_the_port() -> None:

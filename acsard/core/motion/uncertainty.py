@@ -152,6 +152,10 @@ class ErrorModel:
         yaw = min(acceleration.angular * short / 4, speed.angular) * short
         return along**2 + self.of_speed[0] * quantum, yaw**2 + self.of_speed[1] * quantum
 
+    def driven_by_others(self, seconds: Seconds) -> tuple[float, float]:
+        """Return the variances of the position, m2, and the turn, rad2, if anyone drove so long."""
+        return (self.speed.linear * seconds) ** 2, (self.speed.angular * seconds) ** 2
+
 
 class Stretch(Struct):
     """The motion since the last update."""
