@@ -41,7 +41,7 @@ def called(where: Path, *words: str, text: str = "") -> int:
 def test_a_check_that_this_computer_was_too_late_for_has_not_passed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    def late(config: Config) -> Busy:
+    def late(config: Config, _: object) -> Busy:
         return Busy(late_s=0.45, every=3, config=config)
 
     monkeypatch.setattr(mcu, "_wire", late)
@@ -118,7 +118,7 @@ def test_write_without_tomlkit_says_what_to_install(
 def test_the_port_that_was_named_is_written_with_the_rate_it_has(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def board(config: Config) -> VirtualWire:
+    def board(config: Config, _: object) -> VirtualWire:
         built = structs.replace(config, mcu=structs.replace(config.mcu, baud_rate=57600))
         return VirtualWire(FakeMcu(built))
 
