@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 
 import zenoh
+from msgspec import to_builtins
 
 from acsard.bus.address import Address, address_of
 from acsard.bus.robot_discovery import ALL_ROBOTS, Presence, explain_silence, parse_ids, presence
@@ -15,7 +16,8 @@ from acsard.bus.tls import trouble
 from acsard.cli.common import add_config, load
 from acsard.client.connection import Connection, open_connection
 from acsard.client.follower import FIRST_STATE_TIMEOUT_S
-from acsard.core.config.settings import TLS_PREFIX
+from acsard.core.config.live import flat
+from acsard.core.config.settings import TLS_PREFIX, Config
 from acsard.core.formatting import printable
 from acsard.core.messages.keys_and_roles import key_hint, row_of, unknown
 from acsard.host.errors import UnreachableError, UsageError
@@ -121,6 +123,11 @@ def require_readable(key: str, verb: str) -> None:
         )
     row = row_of(key)
     if row is None:
+        if key in dict(flat(to_builtins(Config()))):
+            raise UsageError(
+                f"{key} is a setting: `acsard set` without arguments prints the settings that you "
+                "can change while the daemon runs, and `acsard get config` prints all"
+            )
         if unknown(key) and not has_wildcard and verb == "echo":
             raise UsageError(f"{key} is not a key of the robot: {key_hint(key)}")
         return

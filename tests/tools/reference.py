@@ -183,12 +183,17 @@ def _helps(command: argparse.ArgumentParser, path: str) -> Iterator[str]:
             continue
         named = " ".join(action.option_strings) or str(action.metavar or action.dest)
         value = "" if not action.option_strings or action.nargs == 0 else f" {_value(action)}"
-        rows.append((f"`{named}{value}`", _literal((action.help or "").replace("%%", "%"))))
+        rows.append((f"`{named}{value}`", _literal(_help(action))))
     if rows:
         yield table(("argument", "meaning"), rows)
     for subparser in subparsers:
         for name, child in subparser.choices.items():
             yield from _helps(child, f"{path} {name}")
+
+
+def _help(action: argparse.Action) -> str:
+    """Return the help as argparse prints it, with its values filled in."""
+    return (action.help or "") % {**vars(action), "prog": "acsard"}
 
 
 def _value(action: argparse.Action) -> str:
