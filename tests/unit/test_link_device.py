@@ -96,6 +96,8 @@ def test_a_device_without_permission_is_named_with_what_is_really_so(
     path.chmod(mode)
     shutil.copy("/bin/sleep", program)
     with subprocess.Popen([program if console else "/bin/true", "9"]) as getty:
+        while console and Path(f"/proc/{getty.pid}/comm").read_text() != "agetty\n":
+            pass  # the kernel names a program after the pipe of `Popen` is closed
         refused = refusal(str(path), OSError(errno.EACCES, "Permission denied"))
         getty.kill()
     assert refused.code is Exit.NO_PERMISSION
