@@ -286,7 +286,8 @@ received_statuses
     -> is TX of this computer connected to RX of the board? `acsard mcu check` finds out more
 received_text
     no link to the microcontroller: {received};
-    -> the firmware prints other text between its replies: remove its Serial.print or debug output
+    -> the firmware prints other text: remove its Serial.print or debug output, and let it send
+    replies such as `ap00.00,bp00.00,cp00.00,dp00.00`
 received_form
     no link to the microcontroller: {received};
     -> the lines are whole, but in another form: the firmware must send
