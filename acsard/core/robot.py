@@ -40,7 +40,7 @@ from acsard.core.motion.modes import Mode, RefusedError
 from acsard.core.motion.odometry import Odometry
 from acsard.core.motion.sanity import Sanity
 from acsard.core.motion.uncertainty import ErrorModel
-from acsard.core.motion.wheels import COARSE_ANGLE
+from acsard.core.motion.wheels import COARSE_ANGLE, LEAST_SPEED
 from acsard.core.reasons import reason_of
 from acsard.core.values import (
     NS_PER_S,
@@ -542,7 +542,7 @@ class Robot:
     def _release_port(self, by: str, now: Instant) -> tuple[str, tuple[int, ...]]:
         if self.config.mcu.simulated:
             raise RefusedError("the built-in simulator has no serial port")
-        if not self._at_rest:
+        if not self._at_rest or self._rolls(now.mono_ns):
             raise RefusedError("the port is released only while the robot rests")
         numbers: tuple[int, ...] = ()
         if self._life.mode not in (Mode.STOPPED, Mode.FAULT, Mode.INACTIVE):
@@ -556,6 +556,11 @@ class Robot:
         # Two lines are zero: the last one that left, which the wheels follow, and the last one that
         # was computed.
         return self.speeds == STILL and self._last.motion.twist == REST
+
+    def _rolls(self, now_ns: Ns) -> bool:
+        # The wheels may still turn after the line of zeros, or somebody pushes the robot.
+        speed = max(map(abs, self._odometry.speeds.as_tuple())) * self._kinematics.radius
+        return not self.session.silent(now_ns) and speed > LEAST_SPEED
 
     def _error_model(self) -> ErrorModel:
         config = self.config

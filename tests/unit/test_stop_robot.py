@@ -86,6 +86,20 @@ def test_a_pose_is_as_uncertain_as_the_robot_may_have_been_driven_while_the_port
     assert rig.replug().linked().out.estimates[-1].covariance == after, "nobody else had it"
 
 
+@each(("speed", "released"), [(b"01.10", False), (b"00.90", True)])
+def test_the_port_is_not_released_while_the_board_reports_wheels_above_5_cm_a_second(
+    speed: bytes, released: bool
+) -> None:
+    rig = Rig(REAL).linked()
+    rig.reply = ZERO_LINE.replace(b"00.00", speed)
+    rig.run(5)
+    (answer,) = rig.asked(Request("deactivate", 1, release_port=True)).answers
+    assert (answer.success, rig.robot.port_released) == (released, released)
+    rig.unplug().run(100)
+    (answer,) = rig.asked(Request("deactivate", 1, release_port=True)).answers
+    assert answer.success, "a silent board says nothing about its wheels"
+
+
 def test_neither_a_moving_robot_nor_the_simulator_built_in_releases_the_port() -> None:
     for rig in (Rig(REAL).driving(), Rig().linked()):
         (answer,) = rig.asked(Request("deactivate", 1, release_port=True)).answers
