@@ -123,6 +123,12 @@ def test_settings_for_zenoh_are_accepted(block: Block) -> None:
     zenoh.Config.from_json5(block.text)
 
 
+def test_the_page_of_a_fleet_has_the_lines_of_the_robot_s_file() -> None:
+    own = tomllib.loads((ROOT / "deploy/zenoh/robot.toml").read_text())
+    page = "deploy/manual/pages/howto/fleet.md"
+    assert own in [tomllib.loads(block.text) for block in blocks("toml") if block.page == page]
+
+
 def test_the_subscribers_of_other_languages_are_those_that_are_run() -> None:
     """`tests/system/test_client_languages.py` runs these blocks with another key."""
     calls = re.findall(

@@ -248,7 +248,9 @@ def codes() -> str:
         "Codes and advice",
         "`code` in `state`, `sources`, `causes` and the events says in one word why the robot does "
         "not move, and what went wrong.\nWords in capitals stand for values. `acsard doctor` and "
-        "`acsard echo state -n 1 --short` print the text of your robot.",
+        "`acsard echo state -n 1 --short` print the text of your robot.\n"
+        "`wheel_fault` in `state` is no code and stops nothing: [when a wheel fails]"
+        "(../explanation/wheels.md).",
         table(("code", "text", "what to do"), rows),
     )
 
