@@ -1,4 +1,4 @@
-"""The board's status lines. No damage may make a pressed emergency stop look released."""
+"""The board's status lines. No damage may make a pressed input look released."""
 
 from __future__ import annotations
 
@@ -145,16 +145,21 @@ COUNTS = [4000, pytest.param(1_000_000, marks=[pytest.mark.soak, pytest.mark.tim
 
 @each("check", [False, True])
 @pytest.mark.parametrize("count", COUNTS)
-def test_damage_never_changes_the_emergency_stop(count: int, check: bool) -> None:
+def test_damage_never_changes_the_emergency_stop_or_a_bumper(count: int, check: bool) -> None:
+    """Plain lines may lose bumpers: the robot does not use a line with another number of them."""
     dice, tally = random.Random(33), Counter[str]()
     for _ in range(count):
         # A line with another emergency stop would be true, because it is the later one.
         word = dice.choice((PRESSED, OK))
-        line = word + dice.choice((b"", b" volts=24.31", b" bumpers=..X. volts=24.31 charge=87%"))
+        line = word + dice.choice((b"", b" bumpers=..X.", b" bumpers=..X. volts=24.31 charge=87%"))
         frame = damaged(sealed(line) if check else line, (word, *REPLIES), dice)
         if frame.startswith(STATUS):
             with suppress(FrameError):
-                read = decode_status.__wrapped__(frame, check).estop
-                tally["right" if read in (None, word == PRESSED) else "wrong"] += 1
-    assert check or tally["right"] > count / 100
+                read = decode_status.__wrapped__(frame, check)
+                right = read.estop in (None, word == PRESSED)
+                if read.bumpers is not None and (check or len(read.bumpers) == 4):
+                    right &= read.bumpers == (False, False, True, False)
+                    tally["bumpers"] += 1
+                tally["right" if right else "wrong"] += 1
+    assert check or (tally["right"] > count / 100 and tally["bumpers"] > count / 400)
     assert tally["wrong"] == 0
