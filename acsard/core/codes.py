@@ -29,10 +29,11 @@ WaitCode = Literal[
 
 # States of the link.
 LinkCode = Literal[
-    "port_closed", "port_trouble", "port_blocked", "booting", "link_up", "link_silent", "host_late",
-    "simulator_fault", "echo", "set_points", "no_checksum", "replies_damaged", "lines_too_rare",
-    "reply_period", "received_nothing", "received_statuses", "received_text", "received_form",
-    "received_cut", "received_foreign", "received_garbage", "received_few", "received_sparse",
+    "port_closed", "port_trouble", "port_released", "port_blocked", "booting", "link_up",
+    "link_silent", "host_late", "simulator_fault", "echo", "set_points", "no_checksum",
+    "replies_damaged", "lines_too_rare", "reply_period", "received_nothing", "received_statuses",
+    "received_text", "received_form", "received_cut", "received_foreign", "received_garbage",
+    "received_few", "received_sparse",
 ]  # fmt: skip
 
 # Why the pose may be far off although the link is up.
@@ -236,6 +237,9 @@ port_closed
     the serial port is closed; it is being reopened
 port_trouble
     {trouble}
+port_released
+    the serial port is released to another program:
+    -> call srv/activate to open it again
 booting
     the port is open; waiting for the microcontroller's first good lines
 link_up

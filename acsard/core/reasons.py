@@ -7,6 +7,7 @@ from typing import assert_never
 from acsard.core.board_inputs import BoardInputs
 from acsard.core.codes import Reason, joined, sentence
 from acsard.core.config.settings import Config
+from acsard.core.link.link_diagnosis import PORT_RELEASED
 from acsard.core.link.link_setup import LinkSetup
 from acsard.core.link.session import McuSession
 from acsard.core.motion.arbiter import Choice
@@ -43,6 +44,8 @@ def reason_of(
                 return MISSING_REASON if inputs.estop.missing(safety) else missing_reason(safety)
             return session.describe_link(setup, port_trouble)
         case Mode.STOPPED | Mode.FAULT | Mode.INACTIVE:
+            if port_trouble == PORT_RELEASED.text:
+                return Reason(life.why.code, f"{life.why.text}; also {port_trouble}")
             return life.why
         case Mode.SHUTDOWN:
             return SHUTDOWN_REASON

@@ -16,6 +16,7 @@ from acsard.core.messages.signature import public_name
 from acsard.core.ros.attachments import Attachment
 from acsard.core.ros.shapes import Trigger
 from acsard.core.values import NS_PER_S
+from tests.each import each
 from tests.scenarios.world import World, naming
 
 
@@ -74,7 +75,23 @@ def test_the_port_is_released_at_rest_until_the_next_activate() -> None:
     assert world.call("deactivate", RELEASE).success
     assert (world.state.mode, world.port.released) == ("inactive", True)
     assert world.call("activate").success
+    world.run(1.0)
     assert (world.state.mode, world.port.released) == ("ready", False)
+
+
+@each("ask", ["stop", "deactivate"])
+def test_the_reason_of_each_mode_says_how_to_open_a_released_port(ask: str) -> None:
+    world = World(Config(mcu=McuConfig(port="/dev/ttyACM0")))
+    world.hold(0.0, seconds=1.0)
+    assert world.call(ask).success
+    assert world.call("deactivate", RELEASE).success
+    world.run(1.0)
+    assert "call srv/activate to open it again" in world.state.reason
+    if ask == "stop":
+        assert world.state.mode == "stopped"
+        world.call("clear")
+        world.run(1.0)
+        assert (world.state.mode, world.state.code) == ("waiting", "port_released")
 
 
 def test_shutting_down_ramps_to_rest_and_obeys_no_client(world: World) -> None:

@@ -19,6 +19,7 @@ from acsard.core.incoming.commands import Arrival
 from acsard.core.incoming.imu import SIMULATOR_SENDER
 from acsard.core.incoming.queries import Query, Reply
 from acsard.core.link.codec import Codec
+from acsard.core.link.link_diagnosis import PORT_RELEASED
 from acsard.core.link.serial_output import Offered, SerialOutput
 from acsard.core.messages.encodings import encode
 from acsard.core.messages.frames import FeedbackTopic
@@ -73,6 +74,7 @@ class VirtualPort:
         """Number of bytes of the next line that the kernel takes; None for all."""
         self.trouble = ""
         self.released = False
+        self._lent: FakeMcu | None = None
         self.sent: deque[tuple[int, bytes]] = deque(maxlen=100_000)
         self.mcu: FakeMcu | None = None
         self._opening = (baud_rate, stop, period_ns)
@@ -100,6 +102,13 @@ class VirtualPort:
         return batch
 
     def release(self, released: bool) -> None:
+        if released and self.mcu is not None:
+            self._lent, self.trouble = self.mcu, PORT_RELEASED.text
+            self.unplug()
+        elif not released and self._lent is not None:
+            self.trouble = ""
+            self.plug(self._lent)
+            self._lent = None
         self.released = released
 
     def offer(self, line: bytes, now: Instant) -> Offered:

@@ -410,6 +410,11 @@ story("the buttons for on and off are offered where they change something", asyn
   await pass(200);
   says("mode", "INACTIVE");
   assert.deepEqual(offered(), [true, false]);
+  robot.release(robot.state.causes.map(({ number }) => number));
+  robot.now({ mode: "waiting", code: "port_released" });
+  await pass(200);
+  assert.deepEqual(offered(), [true, true], "activate opens a port that was lent");
+  robot.now({ code: "" });
   robot.latch("stop");
   await pass(200);
   assert.deepEqual(offered(), [false, false]);

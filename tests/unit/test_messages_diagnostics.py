@@ -24,6 +24,7 @@ from acsard.core.config.settings import (
     RobotConfig,
     SafetyConfig,
 )
+from acsard.core.link.link_diagnosis import PORT_RELEASED
 from acsard.core.messages.diagnostics import SHOW_REFUSAL_S, diagnostics
 from acsard.core.messages.schema import DiagnosticStatus
 from acsard.core.motion.bumpers import SILENT_REASON
@@ -61,6 +62,9 @@ SITUATIONS: dict[str, tuple[Config, dict[str, Any]]] = {
     **{f"a link that is {link}": (CONFIG, {"link": link}) for link in ("stale", "booting", "down")},
     "a robot that waits for its link": (
         CONFIG, {"mode": "waiting", "link": "down", "code": "port_trouble"},
+    ),
+    "a port that was released": (
+        CONFIG, {"mode": "stopped", "link": "down", "reason": f"also {PORT_RELEASED.text}"},
     ),
     "a late computer": (CONFIG, {"link": "stale", "code": "host_late"}),
     "the simulator": (Config(), {}),
@@ -132,7 +136,7 @@ SITUATIONS: dict[str, tuple[Config, dict[str, Any]]] = {
 
 
 def statuses(config: Config = CONFIG, **changes: Any) -> list[DiagnosticStatus]:
-    of_status = {key: changes.pop(key) for key in ("mode", "code", "link", "source")
+    of_status = {key: changes.pop(key) for key in ("mode", "code", "link", "source", "reason")
                  if key in changes}  # fmt: skip
     shot: Snapshot = replace(SNAPSHOT, status=replace(SNAPSHOT.status, **of_status), **changes)
     return diagnostics(config, OUTPUTS.now, shot, ("", "")).status

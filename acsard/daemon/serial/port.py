@@ -15,6 +15,7 @@ from collections.abc import Callable
 
 import serial
 
+from acsard.core.link.link_diagnosis import PORT_RELEASED
 from acsard.core.link.serial_output import Offered, Port, SerialOutput
 from acsard.core.values import Event, Instant, Ns, Received
 from acsard.daemon.serial.device import close, draining, open_raw, refusal, unsent
@@ -32,8 +33,6 @@ REOPEN_PAUSES_S = (0.05, 0.1, 0.2)
 PERMISSION_TIMEOUT_S = 2.0  # for udev to grant access at the start
 
 DRIVER_HUNG = "the driver of the serial port did not answer"
-
-RELEASED = "the serial port is released to another program: call srv/activate to open it again"
 
 FINAL_STOP_TIMEOUT_S = 0.15  # twice a line at the lowest baud rate, plus a margin
 
@@ -117,7 +116,7 @@ class SerialPort(Port):
             return
         self._ours.clear()
         self._leave(None)
-        self.trouble = RELEASED
+        self.trouble = PORT_RELEASED.text
 
     # Opening and reopening.
 
@@ -175,7 +174,7 @@ class SerialPort(Port):
         if not self._ours.is_set():
             close(device)
             device.close()
-            raise OSError(errno.EBUSY, RELEASED)
+            raise OSError(errno.EBUSY, PORT_RELEASED.text)
         self._lost.clear()
         self._device, self._fd = device, device.fileno()
         self._output, self.sent_ns = SerialOutput(baud_rate, self._stop, self._period_ns), 0

@@ -186,7 +186,7 @@ function offered() {
 function permitted() {
   const before = absent;
   absent = !state || performance.now() - stateTime > 2 * lasts();
-  permit(hello, absent ? ABSENT : "", NEEDLESS[state?.mode]);
+  permit(hello, absent ? ABSENT : "", NEEDLESS[state?.code === "port_released" ? "" : state?.mode]);
   if (before && !absent && view === "set") configured();
 }
 
