@@ -6,6 +6,8 @@ and a few lines of code replace the storage plugin. `test_access.py` tries the p
 
 from __future__ import annotations
 
+import signal
+import time
 from collections.abc import Iterator
 
 import pytest
@@ -91,6 +93,30 @@ def test_on_a_robot_that_is_a_peer_programs_need_no_router_and_reach_no_other_ro
         first.comes_to("ready")
         assert first.count("commands") == before
     two.at_rest()
+
+
+@pytest.mark.nightly
+@pytest.mark.parametrize("key", ["stop", "srv/stop"])
+def test_a_stop_that_a_stalled_robot_reads_late_is_obeyed(fleet: Fleet, key: str) -> None:
+    daemon, robot = fleet.daemons[0], fleet.robots[0]
+    with fleet.member("viewer") as viewer, robot.commanding(0.1):
+        until(lambda: robot.state()["mode"] == "driving", 3.0, "robot1 drives")
+        daemon.signal(signal.SIGSTOP)
+        try:
+            if key == "stop":
+                viewer.put(key, {})
+            else:
+                replies = viewer.session.get(f"{ONE}/{key}", timeout=10.0)
+            time.sleep(4.0)
+        finally:
+            daemon.signal(signal.SIGCONT)
+        until(lambda: robot.state()["mode"] == "stopped", 3.0, "robot1 is stopped")
+        robot.stands()
+        assert [cause["code"] for cause in robot.state()["causes"]] == ["stopped"]
+        if key != "stop":
+            assert [reply.ok is not None for reply in replies] == [True]
+    assert robot.get("srv/clear")["success"]
+    robot.at_rest()
 
 
 # the files
