@@ -11,8 +11,6 @@ from tests.each import each
 from tests.scenarios.speakers import Speaker
 from tests.scenarios.world import World
 
-NAN = msgspec.msgpack.encode({"linear": {"x": math.nan}, "angular": {}})
-
 
 @pytest.fixture
 def world() -> World:
