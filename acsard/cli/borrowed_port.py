@@ -15,7 +15,7 @@ from acsard.core.values import AcsardError
 from acsard.daemon.serial.blocking import BlockingPort
 from acsard.host import clock
 from acsard.host.errors import InUseError
-from acsard.host.processes import is_daemon_here
+from acsard.host.processes import holder_of, is_daemon_here
 
 CLOSE_TIMEOUT_S = 3.0  # for the daemon to close the port
 
@@ -58,7 +58,8 @@ class BorrowedPort(BlockingPort):
         with self._daemon(in_use) as robot:
             info = robot.get("info")
             ours = is_daemon_here(info.pid) and _device(info.port) == _device(self._port)
-            if not ours:
+            holder = holder_of(self._port)  # None if it is hidden from this user
+            if not ours or (holder is not None and holder.pid != info.pid):
                 raise in_use
             reply = robot.call("deactivate", release_port=True)
         if not reply.success:

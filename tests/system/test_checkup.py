@@ -9,7 +9,9 @@ import tomllib
 from pathlib import Path
 
 import pytest
+import serial
 
+from acsard.daemon.serial.device import open_raw
 from tests.system.harness import Bus, Daemon, FarPeer, Program, acsard, until
 from tests.system.terminals import Terminal, at_terminal
 from tests.system.typed import typed
@@ -51,6 +53,31 @@ def test_a_running_daemon_lends_its_port_and_gets_it_back(tmp_path: Path) -> Non
             assert ended.code == 1
             assert bus.state()["mode"] == "stopped"
             until(lambda: len(daemon.events("port_open")) == 3, 5.0, "the port is open again")
+
+
+def test_a_port_that_another_program_holds_is_not_asked_of_the_daemon(tmp_path: Path) -> None:
+    with Program(acsard("sim", "--link", "mcu"), tmp_path) as sim:
+        sim.says("acsard run --port")
+        port = tmp_path / "mcu"
+        with Daemon(tmp_path, port) as daemon, Bus(daemon.endpoint) as bus:
+            bus.linked()
+            assert bus.get("srv/deactivate", {"release_port": True})["success"]
+            other = until(lambda: opened(port), 5.0, "the port is closed")
+            try:
+                ended = typed("mcu", "check", "--config", str(daemon.config), "--yes")
+            finally:
+                other.close()
+            assert ended.code == 75
+            assert "is in use by process" in ended.err
+            assert "lends" not in ended.err
+            assert len(daemon.events("port_open")) == 1
+
+
+def opened(path: Path) -> serial.Serial | None:
+    try:
+        return open_raw(str(path), 115200)
+    except OSError:
+        return None
 
 
 def test_yes_alone_is_refused_on_a_pty_that_is_not_the_simulator_s() -> None:
