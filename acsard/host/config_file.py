@@ -75,7 +75,7 @@ def writable(path: str | None) -> Path:
     if _is_reference(Path(where)):
         raise MendableError(
             f"{where} was not changed, because git tracks this file of the clone, and a "
-            f"changed file hinders the next `git pull`: type `cp {where} robot.toml` and add "
+            f"changed file hinders the next `git pull`: type `cp -n {where} robot.toml` and add "
             "--config robot.toml",
         )
     require_changeable(Path(where), {})
