@@ -102,6 +102,17 @@ def test_the_motors_are_off_300_ms_after_the_last_valid_line(board: Board, host:
     stays_off(board, 100)
 
 
+def test_lines_that_come_without_a_pause_do_not_restart_the_board(board: Board, host: Host) -> None:
+    host.drive(DRIVE, 0.2)
+    before = board.status()
+    for _ in range(60):
+        host.write((speeds_line(DRIVE) + b"\r\n") * 10)
+        passes(board, 28)
+        host.lines()
+    after = board.status()
+    assert (after.running, after.resets) == (True, before.resets)
+
+
 BAD_LINES = [
     b"", b"hello", b"ap10.00", b"ap10.00,bp10.00,cp10.00", b"ap10.00,bp10.00,cp10.00,",
     b"ap10.00,ap10.00,cp10.00,dp10.00", b"ap10.00,bp10.00,cp10.00,dp100.00",

@@ -126,7 +126,7 @@ void setup() {
 void loop() {
   static unsigned long tick_ms;
   wdt_reset();
-  while (Serial.available()) receive(Serial.read());
+  for (byte most = 64; most && Serial.available(); most--) receive(Serial.read());  // a flood must not stop control()
   if (ESTOP >= 0) watch();
   if (millis() - fed_ms > 300) memset(wanted, 0, sizeof wanted);  // the watchdog: no valid line for 300 ms
   if (millis() - tick_ms >= TICK_MS) tick_ms = millis(), control();
