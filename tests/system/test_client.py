@@ -176,7 +176,7 @@ def test_a_drive_of_a_stopped_robot_raises_the_daemon_s_reason(shared: Daemon, f
         assert not robot.call("clear", numbers=numbers).success
         assert robot.call("clear").success
         robot.call("deactivate")
-        with pytest.raises(NotDrivenError, match="srv/activate"):
+        with pytest.raises(NotDrivenError, match="acsard call activate"):
             robot.drive(0.5, seconds=0.2)
         robot.call("activate")
         robot.drive(0.5, seconds=0.2)

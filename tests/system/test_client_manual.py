@@ -135,7 +135,7 @@ def test_the_async_example_of_the_manual_follows_the_robot_while_it_drives(
 ) -> None:
     ended, state, late = examples["async"]
     assert (ended.code, ended.err) == (0, "")
-    assert len(ended.out.splitlines()) > 100
+    assert len(ended.out.splitlines()) >= 3  # one of 50 messages, 100 a second
     assert state["yaw"] == pytest.approx(0.4, abs=0.02 + 0.2 * late)
     assert state["x"] == pytest.approx(0.97, abs=0.05 + 0.5 * late)
 
