@@ -118,7 +118,7 @@ SLOW = {
 def test_call_loads_no_slow_library() -> None:
     code = "import sys; from acsard.cli import parser; parser(['call']); print(*sys.modules)"
     done = subprocess.run(
-        [sys.executable, "-I", "-c", code], capture_output=True, text=True, check=True, timeout=60
+        [sys.executable, "-P", "-c", code], capture_output=True, text=True, check=True, timeout=60
     )
     assert SLOW & set(done.stdout.split()) == set()
 
