@@ -381,8 +381,8 @@ FAULTS = (
     fault("odometry set", "set_pose takes x for y", ODOMETRY,
           "self.pose = Pose(pose.x, pose.y, math", "self.pose = Pose(pose.y, pose.x, math"),
     fault("odometry gap", "a gap while the robot moves does not make the pose less certain",
-          ODOMETRY, "            if gap and not (rested",
-          "            if gap and gap.seconds > 1e9 and not (rested"),
+          ODOMETRY, "            elif gap and not (rested",
+          "            elif gap and gap.seconds > 1e9 and not (rested"),
     fault("odometry vague", "the covariance of the pose is a hundred times as large as the errors",
         UNCERTAINTY, "        self.covariance = p if known else UNKNOWN_POSE\n",
         "        p = PoseCovariance(*(100.0 * getattr(p, name) for name in p.__struct_fields__))\n"
