@@ -244,7 +244,7 @@ def clocks(running: Running) -> Iterator[Finding]:
             "warning",
             f"the daemon's clock is {abs(running.ahead_s):.1f} s {way} this machine's",
             "let NTP set the clocks of both machines (timedatectl), or let the clients echo the "
-            "key beat (page explanation/age of the manual): commands with an echo do not need "
+            "key beat (page explanation/commands of the manual): commands with an echo do not need "
             "a common clock",
         )
 

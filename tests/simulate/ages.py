@@ -2,7 +2,7 @@
 
 A command with an echo is judged by its true age, which the robot never takes for less than it is. A
 stamp without an echo shows only how much later a command is than the fastest one of the same clock.
-This module follows the law of `explanation/age.md` of the manual by the stamps that the plan's
+This module follows the law of `explanation/commands.md` of the manual by the stamps that the plan's
 senders have made, and is never stricter than that law.
 """
 

@@ -1,7 +1,7 @@
 """Judges which command the robot follows.
 
 The robot reports the arrival time of the command that it follows, so the simulator knows its
-sender. `explanation/senders.md` of the manual says which sender that must be. The judge expects
+sender. `explanation/commands.md` of the manual says which sender that must be. The judge expects
 only commands that the daemon certainly accepts: they have no stamp, or their delays were the lowest
 ones and constant for long enough.
 """

@@ -1,7 +1,7 @@
 """Creates the messages of one sender of a plan: their times of sending and arrival, and bytes.
 
 This module does not use the product. The formats are those of
-`explanation/senders.md` of the manual.
+`explanation/commands.md` of the manual.
 """
 
 from __future__ import annotations

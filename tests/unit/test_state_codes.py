@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import get_args
 
 import acsard
-from acsard.core.codes import CODES, Code, StateCode, WaitCode, joined, reason, sentence
+from acsard.core.codes import CODES, Code, StateCode, joined, reason, sentence
 from acsard.recording.file import SUFFIX, Recording
 from tests import recordings
 
@@ -24,15 +24,6 @@ VALUES = {
     "named": "rain", "wheels": "front_left and front_right", "share": "50 %",
 }  # fmt: skip
 """A value for each name in the texts."""
-
-
-def test_the_page_lists_the_codes_of_the_sources() -> None:
-    page = (PACKAGE.parent / "deploy/manual/pages/reference/reasons.md").read_text(encoding="utf-8")
-    table = page.partition("| code | what to do in your program |")[2].partition("\n\n")[0]
-    listed = {
-        name for row in table.splitlines() for name in re.findall("`(.*?)`", row.split(" | ")[0])
-    }
-    assert listed == {*get_args(WaitCode), "no_command"}
 
 
 def test_the_recordings_publish_only_codes_of_the_table() -> None:
