@@ -7,7 +7,7 @@ samples of a sensor.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack, suppress
 
 import msgspec
@@ -23,9 +23,9 @@ from acsard.client.connection import Connection
 from acsard.client.ride import NEVER_DRIVING_MODES
 from acsard.core.config.settings import Config, DriveConfig
 from acsard.core.messages.keys_and_roles import by_key
-from acsard.core.values import Metres, Rad
+from acsard.core.values import AcsardError, Metres, Rad
 from acsard.host.errors import NoAnswerError, NotDrivenError, UsageError
-from acsard.terminal.prompt import NumberQuestion, Prompt
+from acsard.terminal.prompt import Prompt
 
 SOURCE = "app"
 
@@ -37,7 +37,8 @@ SKID_HEADING, SKID_LENGTH = 0.015, 0.002
 MIN_TAPE_M = 0.5
 TRACKS = 0.85, 3.0  # credible ratios of effective track and wheel separation
 
-Ride = Callable[[Leg], Run]  # raises `NotDrivenError` if the leg may be repeated
+Ride = Callable[[Leg], Run]
+Driven = tuple[Leg, Run, dict[str, Metres]]  # with the answers after it
 
 
 class Options(Struct, frozen=True):
@@ -55,7 +56,7 @@ def drive(
     """Guide a person through a drive. Return its log and the daemon's configuration.
 
     The result may be written into `file`, which has `file_config`, unless it is "". Raises
-    `UsageError` for unsuitable options, and `LogError` or `NotDrivenError` if the drive ends early.
+    `UsageError` for unsuitable options, and another `AcsardError` if the drive ends early.
     """
     info, settings = client.get("info"), client.get("config")
     if options.without_person and not info.simulated:
@@ -95,7 +96,7 @@ def drive(
             if now.simulated != info.simulated or client.get("config") != settings:
                 raise LogError(
                     "another robot answers, or its settings were changed during the calibration: "
-                    "begin again"
+                    "set them back, or begin again"
                 )
             try:
                 return recorder.ride(leg)
@@ -103,11 +104,8 @@ def drive(
                 with suppress(NoAnswerError):  # the reason is known, also if a query is late
                     state = client.get("state")
                     if state.mode in NEVER_DRIVING_MODES:
-                        raise LogError(state.why) from None
+                        raise NotDrivenError(state.why) from None
                 raise
-            except NoAnswerError as error:
-                client.get("info")  # raises if the daemon is still silent
-                raise NotDrivenError(str(error)) from None
 
         try:
             return guided(method, setup, prompt, ride), config
@@ -125,10 +123,7 @@ def _require_own(ours: DriveConfig, theirs: DriveConfig, file: str) -> None:
 
 
 def guided(method: str, setup: Setup, prompt: Prompt, ride: Ride) -> Log:
-    """Return the runs of a guided drive, with what the person measured.
-
-    Raises `LogError` if the drive cannot continue.
-    """
+    """Return the runs of a guided drive, with what the person measured."""
     longest = max(
         sum(leg.seconds for leg in legs(method, setup, track))
         for track in np.arange(1.0, 2.55, 0.05)
@@ -137,46 +132,63 @@ def guided(method: str, setup: Setup, prompt: Prompt, ride: Ride) -> Log:
         f"Calibration with {METHODS[method]}. The robot drives for at most {longest:.0f} s in all. "
         "Stay near it: any key stops it at once."
     )
-
-    def number(ask: NumberQuestion) -> Metres:
-        return prompt.number(ask) / 1000
-
-    wheelbase = number(WHEELBASE) if method == "tape" else 0.0
+    wheelbase = prompt.number(WHEELBASE) / 1000 if method == "tape" else 0.0
+    driven: list[Driven] = []
     runs: list[Run] = []
-    track, slope = 1.0, 0.0  # of the robot to the line, rad
+    track = 1.0
     while len(runs) < len(plan := legs(method, setup, track)):
         leg = plan[len(runs)]
         end = "" if leg.by_key else " It stops by itself: press a key only if you must stop it."
         words = f"{len(runs) + 1}. {leg.words}{end} ({leg.seconds:.0f} s)"
-        run = _repeated(leg, words, prompt, ride)
-        found = {ask.name: number(ask) for ask in leg.asks}
-        readings = []
-        rolled = setup.drive.wheel_radius * (_rolled(run.left) + _rolled(run.right)) / 2
-        if (metres := found.get("distance", 0.0)) >= MIN_TAPE_M:
-            std = math.hypot(TAPE_STD_M, SKID_LENGTH * metres)
-            readings.append(TapeReading("distance", metres, std))
-        if "front" in found:
-            before, slope = slope, line_angle(found["front"], found["rear"], wheelbase)
-            std = math.hypot(2 * LINE_STD_M / wheelbase, SKID_HEADING * math.sqrt(rolled))
-            turned = leg.whole_turns + slope - before
-            readings.append(TapeReading("turn", turned, std))
-            if leg.by_key:
-                track = track_ratio(run, turned, setup.drive)
-        runs.append(replace(run, tape=tuple(readings)))
+        run = _repeated(leg, words, prompt, ride, setup.drive)
+        asks = leg.asks
+        while True:
+            found = {ask.name: prompt.number(ask) / 1000 for ask in asks}
+            wheelbase = found.get(WHEELBASE.name, wheelbase)
+            try:
+                runs = _measured([*driven, (leg, run, found)], wheelbase, setup.drive)
+                break
+            except LogError as error:
+                prompt.show_text(f"{error}: measure again")
+                asks = (WHEELBASE, *leg.asks)
+        driven.append((leg, run, found))
+        if leg.by_key:
+            track = max(1.0, _track_ratio(run, runs[-1].tape[-1].value, setup.drive))
     return Log(tuple(runs), ())
 
 
-def _repeated(leg: Leg, words: str, prompt: Prompt, ride: Ride) -> Run:
+def _repeated(leg: Leg, words: str, prompt: Prompt, ride: Ride, drive: DriveConfig) -> Run:
+    # Whatever interrupts a leg costs only this leg.
     for left in reversed(range(MAX_REPEATS + 1)):
         prompt.start(words)
         try:
-            return ride(leg)
-        except NotDrivenError as error:
+            run = ride(leg)
+            if leg.by_key:
+                _require_one_turn(_track_ratio(run, leg.whole_turns, drive))
+            return run
+        except AcsardError as error:
             if not left:
                 raise
             prompt.show_text(f"This leg has ended early: {error}")
             prompt.instruct("Put the robot back where and how the leg began. Then start it again.")
     raise AssertionError
+
+
+def _measured(driven: Sequence[Driven], wheelbase: Metres, drive: DriveConfig) -> list[Run]:
+    # The runs with their readings. Raises `LogError` if a person cannot have measured them.
+    runs, slope = [], 0.0  # of the robot to the line, rad
+    for leg, run, found in driven:
+        readings = []
+        if (metres := found.get("distance", 0.0)) >= MIN_TAPE_M:
+            std = math.hypot(TAPE_STD_M, SKID_LENGTH * metres)
+            readings.append(TapeReading("distance", metres, std))
+        if "front" in found:
+            before, slope = slope, line_angle(found["front"], found["rear"], wheelbase)
+            rolled = drive.wheel_radius * (_rolled(run.left) + _rolled(run.right)) / 2
+            std = math.hypot(2 * LINE_STD_M / wheelbase, SKID_HEADING * math.sqrt(rolled))
+            readings.append(TapeReading("turn", leg.whole_turns + slope - before, std))
+        runs.append(replace(run, tape=tuple(readings)))
+    return runs
 
 
 def _rolled(angles: Floats) -> float:
@@ -189,20 +201,22 @@ def line_angle(front: Metres, rear: Metres, wheelbase: Metres) -> Rad:
     if abs(sine) > 0.98:
         raise LogError(
             f"two wheels that are {wheelbase * 1000:.0f} mm apart cannot be {front * 1000:.0f} mm "
-            f"and {rear * 1000:.0f} mm from the line: start again, and measure again"
+            f"and {rear * 1000:.0f} mm from the line"
         )
     return math.asin(sine)
 
 
-def track_ratio(run: Run, turned: Rad, drive: DriveConfig) -> float:
-    """Return effective track / wheel separation from one full turn. Raises `LogError`."""
+def _track_ratio(run: Run, turned: Rad, drive: DriveConfig) -> float:
+    # Effective track / wheel separation.
     rolled = float(run.right[-1] - run.left[-1])
-    track = rolled * drive.wheel_radius / drive.wheel_separation / turned
+    return rolled * drive.wheel_radius / drive.wheel_separation / turned
+
+
+def _require_one_turn(track: float) -> None:
     low, high = TRACKS
     if not low < track < high:
-        raise LogError(
+        raise NotDrivenError(
             "the robot should have made one full turn, but by its wheels it turned "
-            f"{math.degrees(track * turned):.0f} deg: let it make exactly one, check "
-            "drive.wheel_radius and drive.wheel_separation with a tape, and start again"
+            f"{360 * track:.0f} deg: let it make exactly one, and check drive.wheel_radius and "
+            "drive.wheel_separation with a tape"
         )
-    return max(1.0, track)

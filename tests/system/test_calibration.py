@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 import msgspec
@@ -16,7 +16,6 @@ from acsard.bus.zenoh_sessions import client_session
 from acsard.calibration.drive import Sensor, place_and_yaw
 from acsard.core.messages.encodings import FORMATS, encode
 from acsard.core.messages.schema import Odometry, PoseStamped
-from acsard.host.errors import Exit
 from tests.system.bystander import lost
 from tests.system.harness import (
     Bus,
@@ -75,14 +74,15 @@ def asks(terminal: Terminal, program: Program, words: str, times: int, within: f
     until(look, within, f"{words!r} for the {times}. time")
 
 
-def begun(terminal: Terminal, program: Program, bus: Bus) -> int:
+def begun(terminal: Terminal, program: Program, bus: Bus, starts: int = 1) -> int:
     """Start the first leg and wait until the robot moves. Return the number of starts.
+
+    `starts` is the number of times that the calibration will have asked for one.
 
     If a busy machine disturbs the leg, it is started again.
     """
-    asks(terminal, program, STARTS, 1, 10.0)
+    asks(terminal, program, STARTS, starts, 10.0)
     terminal.press("\n")
-    starts = 1
 
     def moves() -> bool:
         nonlocal starts
@@ -172,14 +172,24 @@ def test_the_reason_that_ended_a_leg_is_reported(tmp_path: Path, how: str) -> No
 
 
 @pytest.mark.slow
-def test_a_daemon_that_dies_ends_the_leg(tmp_path: Path) -> None:
-    with (
-        running(tmp_path, config=SKIDDING) as (daemon, bus),
-        calibrating(daemon) as (terminal, program),
-    ):
-        begun(terminal, program, bus)
-        daemon.process.kill()
-        assert program.ended(15.0) == Exit.UNREACHABLE
+def test_a_stop_and_a_daemon_that_dies_cost_only_their_leg(tmp_path: Path) -> None:
+    endpoint = free_endpoint()
+    with ExitStack() as robot:
+        daemon, bus = robot.enter_context(running(tmp_path, config=SKIDDING, endpoint=endpoint))
+        with calibrating(daemon) as (terminal, program):
+            starts = begun(terminal, program, bus)
+            bus.put("stop", {})
+            asks(terminal, program, STARTS, starts + 1, 10.0)
+            assert "has ended early: stopped by" in screen_text(terminal)
+            terminal.press("\n")  # before somebody clears the stop
+            asks(terminal, program, STARTS, starts + 2, 10.0)
+            until(lambda: bus.ask("srv/clear")[0].ok, 5.0, "the stop is cleared")
+            starts = begun(terminal, program, bus, starts + 2)
+            robot.close()
+            asks(terminal, program, STARTS, starts + 1, 15.0)
+            assert "nothing received from the daemon" in screen_text(terminal)
+            _, bus = robot.enter_context(running(tmp_path, config=SKIDDING, endpoint=endpoint))
+            begun(terminal, program, bus, starts + 1)
 
 
 @pytest.mark.slow
