@@ -222,6 +222,7 @@ class _Writer:
         self._began_ns = self._synced_ns = 0  # of the file
         self._last: Instant | None = None  # step in the file
         self._has_steps = False  # the file, as far as the disk has accepted them
+        self._added = self._written = 0  # steps of this call: not flushed yet, and flushed
         self._pause = 0  # calls that still write nothing
         self._records = False  # it was reported
         self._lost_before = 0  # when the disk began to refuse
@@ -229,36 +230,35 @@ class _Writer:
 
     def write(self, items: Sequence[PlainStep | Start | Waits | Failure], over: bool) -> None:
         """Write the items of the recorder's queue. The last call ends the file."""
-        steps, written = sum(isinstance(item, tuple) for item in items), 0
+        steps = sum(isinstance(item, tuple) for item in items)
+        self._added = self._written = 0
         if self._pause and not over:
             self._pause -= 1
         else:
             self.timer.begin()
             try:
-                written = self._write(items)
+                self._write(items)
                 self._flush()
+                self._sync()
                 if over:
                     self._end()
             except OSError as error:
-                written = 0
                 self._refuse(error)
             finally:
                 self.timer.end()
-        self.lost += steps - written
-        if written:
+        self.lost += steps - self._written
+        if self._written and not self._pause:
             self._report_success()
         elif steps and self._frames is None and not self._pause:
             self.wants_head = True
 
-    def _write(self, items: Sequence[PlainStep | Start | Waits | Failure]) -> int:
-        # Returns the number of steps that were written: those that follow a head.
+    def _write(self, items: Sequence[PlainStep | Start | Waits | Failure]) -> None:
         steps: list[PlainStep] = []
-        written = 0
         for item in items:
             if isinstance(item, tuple):
                 steps.append(item)
                 continue
-            written += self._add(steps)
+            self._add(steps)
             steps = []
             if isinstance(item, Start):
                 self._begin(item)
@@ -266,18 +266,19 @@ class _Writer:
                 self._frames.add(item)
             elif isinstance(item, Failure) and self._frames is not None:
                 _add_failure(self._frames, item)
-        return written + self._add(steps)
+        self._add(steps)
 
-    def _add(self, steps: list[PlainStep]) -> int:
+    def _add(self, steps: list[PlainStep]) -> None:
+        # Only steps that follow a head.
         if not steps or self._frames is None:
-            return 0
+            return
         self._frames.add_steps(self._number, steps)
         self._number += len(steps)
         last, now = self._last, steps[-1][0]
         if last is not None and abs(ahead_ns(now) - ahead_ns(last)) > CLOCK_JUMP_NS:
             self._ends = self.wants_head = True
         self._last = now
-        return len(steps)
+        self._added += len(steps)
 
     def _begin(self, start: Start) -> None:
         if self._ends:
@@ -306,6 +307,11 @@ class _Writer:
         if not os.fstat(self._file.fileno()).st_nlink:
             raise FileNotFoundError(errno.ENOENT, "the file that is being recorded was removed")
         self._has_steps = True
+        self._written, self._added = self._written + self._added, 0
+
+    def _sync(self) -> None:
+        if self._file is None or self._last is None:
+            return
         now_ns = self._last.mono_ns
         if now_ns - self._synced_ns > SYNC_NS:
             os.fsync(self._file.fileno())
@@ -329,7 +335,7 @@ class _Writer:
     def _end(self) -> None:
         if self._file is not None and self._frames is not None:
             self._frames.end()
-            self._file.flush()
+            self._flush()
             os.fsync(self._file.fileno())
             self._file.close()
         self._file, self._frames, self._ends = None, None, False
