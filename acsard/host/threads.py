@@ -6,6 +6,7 @@ close that hangs in a driver, must not keep the process from ending.
 
 from __future__ import annotations
 
+import _thread
 import asyncio
 import threading
 from collections.abc import Callable
@@ -38,7 +39,7 @@ class Worker(threading.Thread):
         try:
             super().start()
         except RuntimeError as error:
-            raise NoThreadError(f"this process cannot start another thread ({error})") from None
+            raise _no_thread(error) from None
 
     def run(self) -> None:
         try:
@@ -47,6 +48,21 @@ class Worker(threading.Thread):
             if self._failed is None:
                 raise
             self._failed(error)
+
+
+def begin(work: Callable[[], object]) -> None:
+    """Call `work` in a new thread. Raises `NoThreadError`.
+
+    `Thread.start` would wait until the thread runs, on a busy machine for some control periods.
+    """
+    try:
+        _thread.start_new_thread(work, ())
+    except RuntimeError as error:
+        raise _no_thread(error) from None
+
+
+def _no_thread(error: RuntimeError) -> NoThreadError:
+    return NoThreadError(f"this process cannot start another thread ({error})")
 
 
 async def in_thread(
@@ -84,7 +100,7 @@ async def in_thread(
             if not delivered:
                 late(result)  # type: ignore[arg-type]
 
-    Worker(getattr(call, "__name__", "call"), work).start()
+    begin(work)
     try:
         # Before Python 3.12 wait_for swallows a cancellation that coincides with the result.
         async with asyncio.timeout(timeout):
@@ -109,5 +125,5 @@ def future_of(call: Callable[[], T], wake: Callable[[], object]) -> Future[T]:
             future.set_exception(error)
         wake()
 
-    Worker(getattr(call, "__name__", "call"), work).start()
+    begin(work)
     return future

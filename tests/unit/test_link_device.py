@@ -147,6 +147,16 @@ def test_a_port_that_no_thread_could_close_is_closed_by_the_next_opening(path: s
     again.close()
 
 
+def test_a_port_is_closed_without_waiting_for_the_thread_that_closes_it(
+    path: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The control loop releases a port between two periods, which must not be late."""
+    device = open_raw(path, 115200)
+    monkeypatch.setattr(threading.Thread, "start", None)  # it waits
+    close(device, wait_s=5.0)
+    device.close()
+
+
 def test_a_port_is_locked_while_it_is_open_and_free_when_it_is_closed(path: str) -> None:
     device = open_raw(path, 115200)
     with pytest.raises(OSError, match=r"lock|busy") as locked:

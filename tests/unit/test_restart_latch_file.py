@@ -7,7 +7,6 @@ import errno
 import fcntl
 import os
 import re
-import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -341,21 +340,19 @@ def test_a_process_that_was_stopped_during_a_sync_does_not_report_the_disk(
         assert (file.take_events(), file.trouble) == ([], "")
 
 
-@pytest.mark.parametrize("name", ["latches", "<lambda>"])
+@pytest.mark.parametrize("starts", ["threading.Thread.start", "_thread.start_new_thread"])
 def test_a_process_without_room_for_a_thread_starts_the_robot_stopped(
-    name: str, tmp_path: Path, started: Started, monkeypatch: pytest.MonkeyPatch
+    starts: str, tmp_path: Path, started: Started, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    usual = threading.Thread.start
+    """The first writes the file, the second reads it."""
 
-    def start(self: threading.Thread) -> None:
-        if self.name == name:
-            raise RuntimeError("can't start new thread")
-        usual(self)
+    def full(*_: object) -> None:
+        raise RuntimeError("can't start new thread")
 
-    monkeypatch.setattr(threading.Thread, "start", start)
+    monkeypatch.setattr(starts, full)
     file = started(tmp_path)
     assert "can't start new thread" in stopped_at_start(file)
-    if name == "latches":
+    if "Thread" in starts:
         file.wait()
         assert not file.is_stored
         assert file.trouble

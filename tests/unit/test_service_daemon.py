@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
+import _thread
 import asyncio
 import os
 import signal
 import socket
 import sys
-import threading
 from contextlib import AsyncExitStack
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -106,10 +106,10 @@ def test_a_program_that_cannot_be_started_is_reported(monkeypatch: pytest.Monkey
 
 
 def test_a_thread_that_cannot_be_started_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
-    def full(thread: threading.Thread) -> None:
+    def full(*_: object) -> None:
         raise RuntimeError("can't start new thread")
 
-    monkeypatch.setattr(threading.Thread, "start", full)
+    monkeypatch.setattr(_thread, "start_new_thread", full)
     assert asyncio.run(first_event()).name == "gateway_ended"
 
 

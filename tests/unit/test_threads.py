@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import _thread
 import asyncio
+import sys
 import threading
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import partial
 from threading import Thread
 from typing import Any, cast
 
@@ -14,7 +18,7 @@ import pytest
 from acsard.core.values import NS_PER_S
 from acsard.host import clock
 from acsard.host.mailbox import Bell, Mailbox
-from acsard.host.threads import NoThreadError, future_of, in_thread
+from acsard.host.threads import NoThreadError, begin, future_of, in_thread
 
 NO_ROOM = 1 << 46
 """Stack size that no machine can provide, so that a thread with it cannot start."""
@@ -33,6 +37,20 @@ def test_a_thread_that_cannot_be_started_raises_a_timeout_error() -> None:
     with no_more_threads(), pytest.raises(TimeoutError, match="cannot start another thread"):
         asyncio.run(in_thread(lambda: 1, None))
     assert asyncio.run(in_thread(lambda: 1, None)) == 1
+
+
+def test_a_call_in_a_thread_is_begun_without_waiting_for_the_thread() -> None:
+    """Another thread runs only if this one waits for it, or after the switch interval."""
+    ran, usual = list[int](), sys.getswitchinterval()
+    sys.setswitchinterval(10.0)
+    try:
+        begin(partial(ran.append, 1))
+        at_once = list(ran)
+    finally:
+        sys.setswitchinterval(usual)
+    assert at_once == []
+    while not ran:
+        time.sleep(0.001)
 
 
 @pytest.mark.parametrize("rounds", [0, 1, 2])
@@ -73,7 +91,7 @@ def test_a_result_that_arrives_while_its_caller_is_cancelled_is_released_without
         go.wait()
         return 7
 
-    go, usual = threading.Event(), threading.stack_size()
+    go, usual, threads = threading.Event(), threading.stack_size(), _thread._count()
     try:
         result = asyncio.run(caller())
     finally:
@@ -82,8 +100,8 @@ def test_a_result_that_arrives_while_its_caller_is_cancelled_is_released_without
         assert is_released.wait(5.0)
     else:
         # Wait until the thread of `call` has decided.
-        for thread in [t for t in threading.enumerate() if t.name == "call"]:
-            thread.join(5.0)
+        while _thread._count() > threads:
+            time.sleep(0.01)
     assert released == ([7] if result is None else [])
 
 

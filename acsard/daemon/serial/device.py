@@ -8,6 +8,7 @@ import fcntl
 import os
 import struct
 import termios
+import threading
 from collections.abc import Iterator
 from contextlib import suppress
 
@@ -19,7 +20,7 @@ from acsard.host import clock
 from acsard.host.errors import InUseError, MendableError, NoPortError, NotPermittedError
 from acsard.host.port_access import GETTY, console_advice, denial
 from acsard.host.processes import holder_of
-from acsard.host.threads import NoThreadError, Worker
+from acsard.host.threads import NoThreadError, begin
 
 _left_open: list[int] = []  # descriptors that `close` had no thread for
 
@@ -141,13 +142,18 @@ def close(device: serial.Serial, *, lost: bool = False, wait_s: float = 0.0) -> 
         return
     os.dup2(null, fd, inheritable=False)
     os.close(null)
-    thread = Worker("close port", lambda: _end(real))
+    ended = threading.Event()
+
+    def end() -> None:
+        _end(real)
+        ended.set()
+
     try:
-        thread.start()
+        begin(end)
     except NoThreadError:
         _left_open.append(real)
         return
-    thread.join(wait_s)
+    ended.wait(wait_s)
 
 
 def _end(fd: int) -> None:
