@@ -50,19 +50,18 @@ def main(args: argparse.Namespace) -> int:
         rows = fleet.gather()
         if args.json:
             print(json_line(msgspec.json.encode(rows).decode()), flush=True)
-        if not rows:
+        elif rows:
+            width = shutil.get_terminal_size().columns if sys.stdout.isatty() else UNLIMITED_WIDTH
+            # Flush now, so that a session that closes slowly does not hold back the table.
+            print(plain(table(rows, width), width=width), flush=True)
+        if not any(row.here or row.state for row in rows):
             # Over TLS the client's certificate may not be permitted to see any of the named robots.
-            named = [robot_id for robot_id in ids if robot_id != ALL_ROBOTS]
-            silence = robot.sibling(named[0]).whoami().silence if robot.where.tls and named else ""
+            silence = robot.sibling(rows[0].robot_id).whoami().silence if rows else ""
             raise UnreachableError("; ".join(filter(None, (fleet.hint(), silence))))
-        lost = [row.robot_id for row in rows if row.robot_id in ids and absence(row)]
-        code = Exit.UNREACHABLE if lost else Exit.OK
-        if args.json:
-            return code
-        width = shutil.get_terminal_size().columns if sys.stdout.isatty() else UNLIMITED_WIDTH
-        # Flush now, so that a session that closes slowly does not hold back the table.
-        print(plain(table(rows, width), width=width), flush=True)
+    lost = [row.robot_id for row in rows if row.robot_id in ids and absence(row)]
     lost_text = f"gone or silent: {', '.join(lost)}" if lost else ""
-    for text in filter(None, (fleet.presence_text, lost_text, fleet.left_out_text)):
-        print(f"acsard: {text}", file=sys.stderr)
-    return code
+    texts = fleet.presence_text, lost_text, fleet.left_out_text
+    for text in texts[1:] if args.json else texts:
+        if text:
+            print(f"acsard: {text}", file=sys.stderr)
+    return Exit.UNREACHABLE if lost else Exit.OK

@@ -139,8 +139,6 @@ class Roster(Fleet):
                 break
             time.sleep(0.05)
             rows = self.rows()
-        if not any(row.here or row.state for row in rows):
-            return []
         return [replace(row, silent=True) if math.isinf(row.age) else row for row in rows]
 
     @property
@@ -170,10 +168,10 @@ class Roster(Fleet):
         )
 
     def hint(self) -> str:
-        """Return why an empty table shows no robot."""
-        if ALL_ROBOTS in self._ids:
+        """Return why no robot is there."""
+        if tuple(self._ids) == (ALL_ROBOTS,):
             return no_robot_text(self._robot.where.endpoint)
         return (
-            "none of the robots named with --id is present: correct --id, or start the daemons of "
-            "these robots"
+            f"none of these robots is visible at {self._robot.where.endpoint}: start their daemons,"
+            " or correct --id or [fleet] robots"
         )
