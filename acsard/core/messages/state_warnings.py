@@ -12,6 +12,7 @@ from msgspec import Struct
 
 from acsard.core.codes import CODES
 from acsard.core.formatting import printable
+from acsard.core.messages.certificate_expiry import CERTIFICATE_LEVELS
 from acsard.core.messages.schema import BatterySummary, RobotState
 
 What = Literal[
@@ -30,14 +31,6 @@ BATTERY = {
     "warning": "battery low",
     "stop": "battery empty",
     "unknown": "battery level unknown",
-}
-
-
-# Words by the code of the certificates.
-CERTIFICATE = {
-    "expires": "certificate expires in {days:.0f} days",
-    "expired": "certificate expired {days:.0f} days ago",
-    "unknown": "certificate unknown",
 }
 
 
@@ -93,9 +86,8 @@ def _warnings(state: RobotState) -> Iterator[StateWarning]:
         left = charge(state.battery)
         words = BATTERY[state.battery.level]
         yield StateWarning("battery", f"{words} ({left})" if left else words)
-    if state.certificate in CERTIFICATE:
-        brief = CERTIFICATE[state.certificate].format(days=abs(state.certificate_days or 0.0))
-        yield StateWarning("certificate", brief, state.certificate_expiry)
+    if CERTIFICATE_LEVELS.get(state.certificate):
+        yield StateWarning("certificate", f"certificate {state.certificate_expiry}")
     if state.recording_error:
         yield StateWarning("recording", "recording fails", state.recording_error)
     if state.latch_file_error:
