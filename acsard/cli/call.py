@@ -13,7 +13,7 @@ from acsard.bus import robot_discovery
 from acsard.cli.connection import SEVERAL_IDS, add_bus, connected_to_many, several_ids
 from acsard.cli.replies import of_each, print_each
 from acsard.client.connection import Connection
-from acsard.core.formatting import at_terminal, json_line, lines, printable
+from acsard.core.formatting import json_line, lines, printable
 from acsard.core.messages.encodings import encode
 from acsard.core.messages.keys_and_roles import SERVICES
 from acsard.core.messages.schema import MESSAGES, ServiceReply
@@ -77,7 +77,7 @@ def main(args: argparse.Namespace) -> int:
         if many:
             return _stop_all(robot, many, as_json=args.json)
         reply = robot.call(args.service, **fields)
-    text = lines(at_terminal(reply.message))
+    text = lines(reply.message)
     print(json_line(encode(reply, "json").decode()) if args.json else text)
     return 0 if reply.success else 1
 

@@ -10,7 +10,7 @@ import msgspec
 from acsard.bus.robot_discovery import ALL_ROBOTS, count_text, running_robots
 from acsard.client.connection import Connection
 from acsard.core import formatting
-from acsard.core.formatting import at_terminal, printable
+from acsard.core.formatting import printable
 from acsard.core.messages.encodings import DecodeError, detect, encode
 from acsard.core.messages.schema import ServiceReply
 from acsard.core.values import AcsardError
@@ -81,7 +81,7 @@ def print_each(
             barred = isinstance(reply, NotPermittedError)
             reply = ServiceReply(False, (BARRED if barred else silence).format(error=reply))
         line = encode(reply, "json").decode()
-        text = printable(f"{robot_id}: {at_terminal(reply.message)}")
+        text = printable(f"{robot_id}: {reply.message}")
         print(of_robot(robot_id, line) if as_json else text)
     failed = {name: reply for name, reply in replies.items() if isinstance(reply, AcsardError)}
     silent = [name for name, error in failed.items() if not isinstance(error, NotPermittedError)]
