@@ -23,6 +23,7 @@ from acsard.cli.time_range import AFTER_EXAMPLE, TIME_EXAMPLES, TimeError, time_
 from acsard.core.formatting import json_line, printable
 from acsard.core.values import NS_PER_S, WallNs
 from acsard.host.errors import Exit, ExitError, MendableError, RecordingError, UsageError
+from acsard.host.version import version
 from acsard.recording.directory import is_being_recorded
 from acsard.recording.export import ENDINGS, Kind, export, replacing
 from acsard.recording.file import (
@@ -57,8 +58,8 @@ REPLAY_DESCRIPTION = """\
 Run the recorded inputs through the program again, without a robot, and compare the results with the
 recorded ones: each line to the board, and each pose, mode, reason and event. With --config, show
 what another configuration would have changed. A part that is damaged or missing is not compared.
-Exit codes: 0 everything is the same, 1 something differs, 65 a part was not compared and the rest
-is the same. With --config, a difference is no failure.
+Exit codes: 0 everything is the same, 1 something differs (as it may if another version recorded
+it), 65 a part was not compared and the rest is the same. With --config, a difference is no failure.
 """
 
 EXPORT_DESCRIPTION = """\
@@ -178,8 +179,8 @@ def main(args: argparse.Namespace) -> int:
             rows.append((path.name, "", size, "the beginning cannot be read"))
         elif _overlaps(head, status, begin_ns, end_ns):
             note = " [being recorded]" if is_being_recorded(path, time.time()) else ""
-            version = f"acsard {printable(head.version)}{note}"
-            rows.append((path.name, _clock(head.wall_ns), size, version))
+            by = f"acsard {printable(head.version)}{note}"
+            rows.append((path.name, _clock(head.wall_ns), size, by))
     if rows:
         show(table(rows, right={2}))
     else:
@@ -225,6 +226,9 @@ def main_replay(args: argparse.Namespace) -> int:
     if head is None or not comparison.steps:
         raise _nothing(args)
     print(f"{verdict(comparison)}\n{explain_verdict(other is not None)}")
+    if head.version != version():
+        by = f"acsard {printable(head.version)} recorded this, and acsard {version()} replayed it"
+        print(f"{by}: a difference may come from what changed between them")
     rows, began_ns = list[str](), head.mono_ns
     if other is not None:
         rows = explain_settings(config_of(head), other, comparison, began_ns)
