@@ -28,7 +28,7 @@ QUESTIONS = {
     "What must my program send before it drives?": ("explanation/commands.md", "zero"),
     "How do I drive from Go?": ("howto/languages.md", "go run"),
     "What is the default of `wheel_radius`?": ("reference/settings.md", "`wheel_radius`"),
-    "How do I install it without internet?": ("howto/install-package.md", "dpkg --install"),
+    "How do I install it without internet?": ("howto/install.md", "dpkg --install"),
     "How do I undo an upgrade?": ("howto/upgrade.md", "service rollback"),
     "What happened at 14:05?": ("howto/what-happened.md", "show --from 14:05"),
     "How do I let a phone drive?": ("howto/phone.md", "invite operator"),
@@ -36,7 +36,7 @@ QUESTIONS = {
     "How do I stop all robots?": ("howto/fleet-all.md", "acsard call stop --id"),
     "How do I let a laptop in?": ("howto/access.md", "tls init"),
     "Which role may clear a stop?": ("reference/keys.md", "| operator | all of viewer"),
-    "How do I change a setting for good?": ("howto/settings.md", "--keep"),
+    "How do I change a setting for good?": ("howto/service.md", "--keep"),
 }
 
 

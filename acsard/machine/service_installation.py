@@ -41,7 +41,7 @@ def missing_prerequisite(group: str = GROUP, program: str = SETPRIV) -> str:
     except KeyError:
         return (
             f"this system has no group {group}, which lets the service use the serial port; run "
-            f"`groupadd --system {group}`; page howto/install-uv of the manual has another group"
+            f"`groupadd --system {group}`; page howto/install of the manual has another group"
         )
     return ""
 

@@ -177,7 +177,7 @@ def test_the_first_command_of_the_readme_installs_it_and_the_robot_is_up(clone: 
 @pytest.mark.nightly
 @pytest.mark.timeout(2 * INSTALL_S)
 def test_the_service_s_venv_has_all_that_lan_and_service_need(clone: Path) -> None:
-    page, venv = "deploy/manual/pages/howto/install-uv.md", clone / ".venv"
+    page, venv = "deploy/manual/pages/howto/install.md", clone / ".venv"
     for command in (
         find(page, "python3 -m venv"),
         find(page, ".venv/bin/pip install -r"),

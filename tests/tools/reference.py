@@ -65,7 +65,7 @@ def settings() -> str:
         "Settings",
         "`acsard.toml` of the robot has these keys. A key that the file lacks has its default. "
         "`acsard check` prints the value\nof every key, or every mistake with its remedy. "
-        "[Set a value](../howto/settings.md) says how to change one.",
+        "[Change a setting for good](../howto/service.md#change-a-setting-for-good) says how.",
         *parts,
     )
 
