@@ -32,8 +32,8 @@ from acsard.recording.recorded_steps import StepRecorder
 # Least delay of a line; less is reported as 0, as the estimated sample times are less exact.
 MIN_WRITE_DELAY_NS = 1_000_000
 
-# Asking the keeper for events takes 8 us, too long for each period.
-KEEPER_PERIOD_NS = NS_PER_S // 10
+# Between two looks at the latch file and the health of the bus, too slow for each period.
+LOOK_NS = NS_PER_S // 10
 
 # The line on the port, why the guard replaced the robot's, and how late it was written.
 Left = tuple[bytes | None, Trip, Ns]
@@ -67,7 +67,7 @@ class ControlLoop:
         mcu = robot.config.mcu
         self.pace = Pace(wire_ns(mcu.line_bytes, mcu.baud_rate), robot.config.period_ns)
         self._start_ns, self._mono_ns = start.mono_ns, mono_ns
-        self._keeper_ns = start.mono_ns  # when to look for events of the keeper
+        self._look_ns = start.mono_ns
         if recorder is not None and robot.latches != Latches():
             # Without this record, a replay would start with a robot that has no latches.
             recorder.begins(robot, self._guard)
@@ -98,12 +98,13 @@ class ControlLoop:
             if period is not NO_PERIOD:
                 tick = pace.period_ended(heard.missed)
             news = robot.hear(now, heard)
-            if heard.requests:
-                port.release(robot.port_released)
-            # The latches do not change without news.
-            if news is not QUIET and robot.latches is not keeper.latches:
-                keeper.keep(robot.latches)
-            due = tick or (news.urgent and pace.at_once(now.mono_ns, port.sent_ns))
+            due = tick
+            if news is not QUIET:
+                if heard.requests:
+                    port.release(robot.port_released)
+                if robot.latches is not keeper.latches:
+                    keeper.keep(robot.latches)
+                due = tick or (news.urgent and pace.at_once(now.mono_ns, port.sent_ns))
             if due:
                 line = robot.drive(now)
                 if line is not None:
@@ -115,9 +116,9 @@ class ControlLoop:
             if recorder is not None and heard is not None:
                 recorder.died(now, heard)
             raise
-        urgent, had_input = news.urgent, bool(heard.commands or heard.refusals or heard.requests)
-        if due or urgent or had_input or period is not NO_PERIOD or pace.waiting:
-            pace.record_step(tick, due, left[0] is not None, urgent, had_input, port.sent_ns)
+        had_input = bool(heard.commands or heard.refusals or heard.requests)
+        if had_input or news.urgent or period is not NO_PERIOD or pace.waiting:
+            pace.record_step(tick, due, left[0] is not None, news.urgent, had_input, port.sent_ns)
         if recorder is not None:
             step = now, heard, due, line, *left, news, robot.status
             recorder.step(step, robot, self._guard)
@@ -135,9 +136,10 @@ class ControlLoop:
         if period is not NO_PERIOD:
             missed = period.expired - 1
             publication.stopwatch.period(now.mono_ns, now.mono_ns - period.due_ns, missed)
-            if now.mono_ns >= self._keeper_ns:
-                self._keeper_ns = now.mono_ns + KEEPER_PERIOD_NS
+            if now.mono_ns >= self._look_ns:
+                self._look_ns = now.mono_ns + LOOK_NS
                 intake.events += self._keeper.take_events()
+                intake.look()
         # Call `take` before reading `is_open`: in a late wake-up it may find the port lost.
         taken, received = intake.take(publication.serve), port.take(now if missed else None)
         events: tuple[Event, ...] = ()

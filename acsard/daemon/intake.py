@@ -16,7 +16,6 @@ from acsard.core.incoming.bus_interface import GATEWAY_KEY as GATEWAY
 from acsard.core.incoming.bus_interface import (
     NO_INPUT,
     Bus,
-    BusInput,
     GatewayFollower,
     RouterFollower,
 )
@@ -93,7 +92,8 @@ class Intake:
         requests: list[Request] = []
         gyro: list[GyroSample] = []
         speed_cap: SpeedCap | None = None
-        self._note(batch)
+        if batch.overrun:
+            self.counters["bus_overrun"] += batch.overrun
         for arrival in batch.arrivals:
             try:
                 if arrival.key == "stop":
@@ -135,14 +135,14 @@ class Intake:
         self._batch = self._bus.take(0)
         return self.taken_stops()
 
-    def _note(self, batch: BusInput) -> None:
-        if batch.overrun:
-            self.counters["bus_overrun"] += batch.overrun
-        if batch.dropped:
-            self.counters["bus_dropped"] += batch.dropped
-        if batch.routers is not None:
-            self.routers.receive(batch.routers, self.counters, self.events)
-        if batch.stuck:
+    def look(self) -> None:
+        """Count what the bus has lost, and note its routers; call this ten times a second."""
+        health = self._bus.look()
+        if health.dropped:
+            self.counters["bus_dropped"] += health.dropped
+        if health.routers is not None:
+            self.routers.receive(health.routers, self.counters, self.events)
+        if health.stuck:
             self.counters["bus_stuck"] += 1
             self.events.append(BUS_STUCK)
 

@@ -91,10 +91,9 @@ class Publication:
         `applied` is the twist in a line that was due.
         """
         bus, report, now, config = self.bus, self.report, self.now, self._robot.config
-        is_new = config is not self._config
+        is_new, wanted = config is not self._config, bus.wanted_keys
         if is_new:
             self._use(config, news.answers)
-        wanted = bus.wanted_keys
         for estimate in news.estimates:
             for topic in report.feedback_due(estimate, wanted):
                 bus.publish_feedback(topic, estimate)

@@ -31,9 +31,9 @@ class Pulse:
         self._period_ns = self._due_ns = 0  # the latter by the timer's clock
         self._next_ns = 0  # about the same time by the daemon's clock
         self._alarm_ns: Ns | None = None
-        self._step: Step | None = None
-        self._pace: Pace | None = None
-        self._over: asyncio.Future[None] | None = None
+        self._step: Step | None = None  # None: none may run now
+        self._pace: Pace
+        self._over: asyncio.Future[None]
         self._early = self._command_waits = self._stop_waits = False
 
     async def run(self, period_ns: Ns, step: Step, pace: Pace) -> None:
@@ -96,23 +96,23 @@ class Pulse:
             self(clock.now())
 
     def _run(self, now: Instant, period: Period) -> None:
-        step, pace, over = self._step, self._pace, self._over
-        if step is None or pace is None or over is None:
+        step, pace = self._step, self._pace
+        if step is None:
             return  # during a step, such as for a port that it has found lost, or after the last
         self._step, self._command_waits = None, False
         try:
             if not step(now, period):
-                over.set_result(None)
+                self._over.set_result(None)
                 return
         except BaseException as error:  # noqa: BLE001
             # A bug in a step must end the process: as an error of `run`, which the daemon reports.
-            over.set_exception(error)
+            self._over.set_exception(error)
             return
-        self._step = step
-        retry_ns = pace.retry_ns
-        if retry_ns is not None and retry_ns != self._alarm_ns:
-            self._alarm.set(retry_ns)
-        self._alarm_ns = retry_ns
+        self._step, retry_ns = step, pace.retry_ns
+        if retry_ns != self._alarm_ns:
+            self._alarm_ns = retry_ns
+            if retry_ns is not None:
+                self._alarm.set(retry_ns)
         self._early = early = pace.early
         if early or period is not NO_PERIOD:
             self._stop_waits = False

@@ -14,7 +14,7 @@ import msgspec
 from msgspec.structs import replace
 
 from acsard.core.config.settings import Config
-from acsard.core.incoming.bus_interface import NO_INPUT, BusInput
+from acsard.core.incoming.bus_interface import NO_INPUT, BusHealth, BusInput
 from acsard.core.incoming.commands import Arrival
 from acsard.core.incoming.imu import SIMULATOR_SENDER
 from acsard.core.incoming.queries import Query, Reply
@@ -155,6 +155,9 @@ class MemoryBus:
         self.displaced.clear()
         del self.queries[:queries]
         return batch
+
+    def look(self) -> BusHealth:
+        return BusHealth()
 
     def publish(self, key: str, message: Message) -> None:
         self.published.setdefault(key, deque(maxlen=100_000)).append(message)

@@ -23,12 +23,17 @@ class BusInput(Struct, frozen=True):
     queries: tuple[Query, ...] = ()
     overrun: int = 0  # samples that the control loop did not fetch in time
     displaced: tuple[Arrival, ...] = ()  # the newest of them of each sender of commands
-    dropped: int = 0  # published messages that the bus did not send in time
-    stuck: bool = False  # a send has begun to block since the previous `take`
-    routers: RoutersStatus | None = None  # None: not changed
 
 
 NO_INPUT = BusInput()
+
+
+class BusHealth(Struct, frozen=True):
+    """What has happened to the bus since the previous call of `Bus.look`."""
+
+    dropped: int = 0  # published messages that the bus did not send in time
+    stuck: bool = False  # a send has begun to block
+    routers: RoutersStatus | None = None  # None: not changed
 
 
 class Waker(Protocol):
@@ -54,6 +59,9 @@ class Bus(Protocol):
         Their order is: service calls, one slow one (ROS parameters, `set`), which comes even beyond
         the limit, and others. The rest waits.
         """
+
+    def look(self) -> BusHealth:
+        """Return what has happened to the bus since the last call; call it ten times a second."""
 
     # Gets the time from the read of a feedback line until Zenoh had its message, in any thread.
     feedback_sent: Callable[[Ns], object]

@@ -11,12 +11,11 @@ from collections.abc import Callable
 from functools import partial
 
 import zenoh
-from msgspec.structs import replace
 
 from acsard.bus.subscription import direct
 from acsard.bus.zenoh_sessions import daemon_session
 from acsard.core.config.settings import Config
-from acsard.core.incoming.bus_interface import NO_INPUT, BusInput, Waker
+from acsard.core.incoming.bus_interface import BusHealth, Waker
 from acsard.core.incoming.imu import SIMULATOR_SENDER
 from acsard.core.incoming.queries import Reply
 from acsard.core.messages.keys_and_roles import IMU, Topic, full_key, json_key, offered, published
@@ -60,6 +59,7 @@ class ZenohBus:
         # A method of this class would be one more call for each message and wake-up.
         self.publish, self.publish_feedback = outlets.publish, outlets.publish_feedback
         self.publish_beat, self.flush = outlets.publish_beat, outlets.flush
+        self.take = self._inbox.take
         self._links = RouterLinks(config.bus, self._thread_errors)
         self._session: zenoh.Session
         self._entities: list[object] = []  # Zenoh undeclares an entity when nothing refers to it
@@ -70,16 +70,8 @@ class ZenohBus:
     def wanted_keys(self) -> frozenset[str]:
         return self._outlets.wanted
 
-    def take(self, queries: int) -> BusInput:
-        inbox = self._inbox
-        batch = inbox.take(queries) if inbox.any else NO_INPUT
-        changes = self._links.changes
-        if changes.waiting:
-            batch = replace(batch, routers=changes.pop())
-        if not self._outlets.behind:
-            return batch
-        dropped, stuck = self._outlets.losses(clock.mono_ns())
-        return replace(batch, dropped=dropped, stuck=stuck) if dropped or stuck else batch
+    def look(self) -> BusHealth:
+        return BusHealth(*self._outlets.losses(clock.mono_ns()), self._links.changes.pop())
 
     @property
     def feedback_sent(self) -> Callable[[Ns], object]:

@@ -16,7 +16,7 @@ from itertools import count
 
 import zenoh
 
-from acsard.core.incoming.bus_interface import BusInput, Waker
+from acsard.core.incoming.bus_interface import NO_INPUT, BusInput, Waker
 from acsard.core.incoming.commands import Arrival, Via, parts
 from acsard.core.incoming.queries import Query, Reply, most_bytes, refused
 from acsard.core.messages.keys_and_roles import (
@@ -176,12 +176,14 @@ class Inbox:
         self._lost = dict.fromkeys(self._arrivals, 0)  # displaced samples that `take` has reported
         # The newest displaced command of each sender since the last `take`.
         self._displaced: dict[tuple[str, Via, str, bool], Arrival] = {}
-        self.any = False  # call `take`; set after the item is in its buffer, so it overlooks none
+        self._any = False  # set after the item is in its buffer, so `take` overlooks none
         self._waker = waker
 
     def take(self, queries: int) -> BusInput:
         """Return the samples since the last call, stops first, and up to `queries` queries."""
-        self.any = False
+        if not self._any:
+            return NO_INPUT
+        self._any = False
         arrivals, overrun = list[Arrival](), 0
         for key, box in self._arrivals.items():
             if not box.waiting:
@@ -197,7 +199,7 @@ class Inbox:
         due_queries += _taken_of(self._others, queries - len(due_queries))
         if self._services or self._slow or self._others:
             # The other queries wait for the next step.
-            self.any = True
+            self._any = True
         return BusInput(tuple(arrivals), tuple(due_queries), overrun, tuple(displaced.values()))
 
     # Zenoh's threads call the methods below.
@@ -278,10 +280,10 @@ class Inbox:
         return any_certificate if any_certificate in self._arrivals else OTHER_SOURCES
 
     def _note(self) -> None:
-        self.any = True
+        self._any = True
 
     def _stopped(self) -> None:
-        self.any = True
+        self._any = True
         self._waker.stop()
 
     def on_query(self, topic: str, query: zenoh.Query) -> None:
@@ -340,7 +342,7 @@ class Inbox:
             self._replies.retire(ticket)
             return
         waiting.append(item)
-        self.any = True
+        self._any = True
 
 
 def _bytes(payload: zenoh.ZBytes | None, most: int) -> bytes:

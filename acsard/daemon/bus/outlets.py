@@ -152,11 +152,6 @@ class Outlets:
             self._dropped += 1
         self._waiting = True
 
-    @property
-    def behind(self) -> bool:
-        """Whether the caller must call `losses`: messages were dropped, or may be blocked."""
-        return self._began_ns is not None or self._stuck or self._dropped > 0
-
     def losses(self, now_ns: Ns) -> tuple[int, bool]:
         """Return the newly dropped messages, and whether the bus has begun to block."""
         dropped, self._dropped = self._dropped, 0
