@@ -263,7 +263,7 @@ def _said(text: str) -> str:
 
 
 def http() -> str:
-    """Return the paths of the page for programs."""
+    """Return the paths of the page for programs, and its metrics."""
     rows = (
         (f"`{row.method}`", f"`{row.path}`", row.least or "none needed", row.summary)
         for row in ROUTES
@@ -271,14 +271,17 @@ def http() -> str:
     )
     return _page(
         "HTTP API",
-        "The robot's page serves these paths to programs; `GET /api/openapi.json` describes them "
-        "with their types. A program on\nthe robot needs no token.",
+        "The robot's page serves these paths to [programs](../howto/http.md); `GET /api` describes "
+        "them with their types.",
         table(("method", "path", "least role", "purpose"), rows),
+        "## Metrics\n\n`GET /metrics` returns these metrics. Each has the label `robot`. A metric "
+        "of a value that the robot does not report\nis missing.\n",
+        metrics(),
     )
 
 
 def metrics() -> str:
-    """Return the metrics of a robot that reports everything."""
+    """Return the table of the metrics of a robot that reports everything."""
     battery = BatterySummary(volts=12.0, amps=1.0, percent=50.0, level="ok")
     state = replace(
         STATE, emergency_stop="released", bumpers=[False], battery=battery, certificate_days=1.0
@@ -291,12 +294,7 @@ def metrics() -> str:
         rows.append(
             (f"`{name}`", ", ".join(f"`{label}`" for label in labels), family.documentation)
         )
-    return _page(
-        "Metrics",
-        "`GET /metrics` of the robot's page returns these metrics. Each has the label `robot`. A "
-        "metric of a\nvalue that the robot does not report is missing.",
-        table(("metric", "further labels", "meaning"), rows),
-    )
+    return table(("metric", "further labels", "meaning"), rows)
 
 
 # ROS and promises
@@ -338,7 +336,6 @@ GENERATED: dict[str, Callable[[], str]] = {
     f"{PAGES}/python.md": python_client,
     f"{PAGES}/codes.md": codes,
     f"{PAGES}/http.md": http,
-    f"{PAGES}/metrics.md": metrics,
     f"{PAGES}/ros.md": ros,
     f"{PAGES}/promises.md": promises,
 }

@@ -12,7 +12,7 @@ import pytest
 from jsonschema import Draft202012Validator
 from openapi_spec_validator import OpenAPIV31SpecValidator
 
-from acsard.core.messages.keys_and_roles import SERVICES, TOPICS, row_of
+from acsard.core.messages.keys_and_roles import SERVICES, TOPICS
 from acsard.core.messages.permissions import SERVICE_ROLES
 from acsard.web.app import ROUTES
 from acsard.web.openapi import TO_ROBOT, document
@@ -94,21 +94,3 @@ def test_only_a_stop_is_served_beyond_the_limits_of_a_token() -> None:
 def test_each_service_has_the_role_that_the_bus_asks_for() -> None:
     roles = {row.path: row.least for row in ROUTES if row.method == "POST"}
     assert {verb: roles[f"/api/srv/{verb}"] for verb in SERVICES} == SERVICE_ROLES
-
-
-def named(cell: str) -> set[tuple[str, str]]:
-    """Return the method with each path that the first cell of a table row on the page names."""
-    method = re.search("GET|POST", cell)
-    return {(method[0], path) for path in re.findall(r"(/\S+)`", cell)} if method else set()
-
-
-def test_the_page_has_a_row_for_each_path_that_programs_may_use() -> None:
-    page = (MANUAL / "howto/http.md").read_text()
-    table = page.partition("| request | meaning |")[2].partition("Over the WebSocket")[0]
-    routes = {
-        route for line in table.splitlines() for route in named("".join(line.split("|")[1:2]))
-    }
-    rows = {(row.method, row.path.replace("{name}", "NAME")) for row in ROUTES if row.summary}
-    of_the_bus = {route for route in rows if row_of(route[1].removeprefix("/api/")) is not None}
-    elsewhere = {("GET", "/api")}  # in a sentence
-    assert routes - of_the_bus - {("GET", "/api/schema/Twist")} == rows - of_the_bus - elsewhere
