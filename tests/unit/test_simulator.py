@@ -6,7 +6,9 @@ encoders, so it reports exactly the commanded speeds.
 
 from __future__ import annotations
 
+import asyncio
 import binascii
+import os
 import re
 from itertools import pairwise, permutations
 from typing import Any, get_args
@@ -22,6 +24,8 @@ from acsard.core.simulator.baud_mismatch import garbled
 from acsard.core.simulator.fake_mcu import MS, RESET_NS, FakeMcu
 from acsard.core.simulator.protocol import Command, latched, plain_only, prefix, reference
 from acsard.core.simulator.virtual_wire import VirtualWire
+from acsard.daemon.serial.simulator_pty import SimPty
+from acsard.host import clock
 from tests.each import each
 
 PLAIN = b"ap12.50,bn08.75,cp15.00,dn10.25"
@@ -271,6 +275,22 @@ def test_a_line_is_answered_at_its_virtual_time_and_garbled_at_a_wrong_baud_rate
     wire.close()
     with pytest.raises(AssertionError):
         wire.send(ZERO)
+
+
+def test_a_simulator_that_stalled_obeys_the_newest_lines_only() -> None:
+    async def stalls(count: int) -> FakeMcu:
+        with SimPty(FakeMcu(Config(), clock.mono_ns())) as simulator:
+            host = os.open(simulator.path, os.O_WRONLY | os.O_NOCTTY)
+            for number in range(count):
+                os.write(host, ZERO.replace(b"ap00", b"ap%02d" % number))
+            while len(simulator.mcu.heard) < min(count, 7):
+                await asyncio.sleep(0.01)
+            os.close(host)
+            return simulator.mcu
+
+    for count, first in ((5, 0), (50, 43)):
+        lines = [line for _, line in asyncio.run(asyncio.wait_for(stalls(count), 5.0)).heard]
+        assert [int(line[2:4]) for line in lines] == list(range(first, count))
 
 
 @each(("sent", "rx_rate"), list(permutations(get_args(Baud), 2)))
