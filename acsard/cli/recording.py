@@ -124,18 +124,15 @@ def add_options(parser: argparse.ArgumentParser) -> None:
             help="file to write (default: named after the recording, in the working directory)",
         )
         action.add_argument("--force", action="store_true", help="overwrite an existing file")
-    form = exported.add_mutually_exclusive_group()
-    for kind, text in (
-        (
-            "csv",
-            "write a CSV table with one row per feedback line; its first columns are those that "
-            "`acsard calibrate log` reads",
-        ),
-        ("rosbag2", "write a directory with metadata.yaml, as `ros2 bag` does"),
-    ):
-        form.add_argument(
-            f"--{kind}", dest="kind", action="store_const", const=kind, default="mcap", help=text
-        )
+    exported.add_argument(
+        "--csv",
+        dest="kind",
+        action="store_const",
+        const="csv",
+        default="mcap",
+        help="write a CSV table with one row per feedback line; its first columns are those that "
+        "`acsard calibrate log` reads",
+    )
     for action in (replay, exported):
         action.add_argument(
             "--config",
@@ -357,7 +354,7 @@ def _new(args: argparse.Namespace, recording: Recording, ending: str) -> Path:
     if new.suffix not in ("", ending):
         raise UsageError(
             f"{new} does not end with {ending}: a report ends with .html, and an export with "
-            ".mcap, with --csv with .csv, with --rosbag2 with .rosbag2"
+            ".mcap, or with --csv with .csv"
         )
     return new
 

@@ -1,4 +1,4 @@
-"""Writes a recording for other programs: ROS messages in MCAP or a ROS 2 bag, or a CSV table.
+"""Writes a recording for other programs: ROS messages in MCAP, or a CSV table.
 
 In the table, each feedback line and each gyro sample has a row, which begins with the columns that
 `acsard calibrate` reads. It must not use `odom_...` as measured positions: odometry is computed
@@ -8,15 +8,12 @@ with the dimensions that the calibration has to find.
 from __future__ import annotations
 
 import os
-import shutil
+from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
 from errno import EEXIST
 from pathlib import Path
 from typing import BinaryIO, Literal
-
-import msgspec
-from msgspec import Struct
 
 from acsard.core.config.settings import Config
 from acsard.core.robot import Robot
@@ -30,10 +27,10 @@ from acsard.recording.published import Published, published
 from acsard.recording.recorded_steps import RecordedStep
 from acsard.recording.replay import Playback, config_of
 
-Kind = Literal["mcap", "csv", "rosbag2"]
+Kind = Literal["mcap", "csv"]
 
 # End of the default name.
-ENDINGS: dict[Kind, str] = {"mcap": ".mcap", "csv": ".csv", "rosbag2": ".rosbag2"}
+ENDINGS: dict[Kind, str] = {"mcap": ".mcap", "csv": ".csv"}
 
 _RELIABLE, _BEST_EFFORT = 1, 2
 _TRANSIENT_LOCAL, _VOLATILE = 1, 2
@@ -50,26 +47,16 @@ def export(
     (nothing to write, or no replay), `FileExistsError`, `OSError`.
     """
     with replacing(new, force) as part:
-        count = _write(recording, part, new.name, kind, other)
+        count = (_write_mcap if kind == "mcap" else _write_csv)(recording, part, other)
         if not count:
             raise RecordingError("there is nothing to export; correct --from and --to")
         return count
 
 
-def _write(recording: Recording, part: Path, name: str, kind: Kind, other: Config | None) -> int:
-    match kind:
-        case "csv":
-            rows = table(recording, other)
-            with part.open("w", encoding="ascii", newline="\n") as stream:
-                return sum(1 for row in rows if stream.write(",".join(row) + "\n")) - 1
-        case "mcap":
-            return _write_mcap(recording, part, other).count
-        case "rosbag2":
-            part.mkdir()
-            file = f"{name}_0.mcap"
-            written = _write_mcap(recording, part / file, other)
-            (part / "metadata.yaml").write_text(bag_metadata(file, written), encoding="utf-8")
-            return written.count
+def _write_csv(recording: Recording, file: Path, other: Config | None) -> int:
+    rows = table(recording, other)
+    with file.open("w", encoding="ascii", newline="\n") as stream:
+        return sum(1 for row in rows if stream.write(",".join(row) + "\n")) - 1
 
 
 @contextmanager
@@ -92,35 +79,16 @@ def replacing(new: Path, force: bool) -> Iterator[Path]:
         yield part
         os.replace(part, new)
     finally:
-        if part.is_dir():
-            shutil.rmtree(part)
-        else:
-            part.unlink(missing_ok=True)
+        part.unlink(missing_ok=True)
 
 
 # ROS messages
 
 
-class BagTopic(Struct):
-    name: str
-    channel: Channel
-    number: int  # of the channel in the MCAP file
-    count: int = 0
-
-
-class Written(Struct):
-    """What is in an MCAP file."""
-
-    topics: dict[tuple[str, str], BagTopic] = {}  # by name of the channel, and source
-    count: int = 0  # messages
-    first_ns: WallNs = 0
-    last_ns: WallNs = 0
-
-
-def _write_mcap(recording: Recording, file: Path, other: Config | None) -> Written:
+def _write_mcap(recording: Recording, file: Path, other: Config | None) -> int:
     head = recording.head()
     if head is None:
-        return Written()
+        return 0
     names = ", ".join([path.name for path in recording.paths])
     origin = {"robot": head.robot, "recording": names, "recorded_by": f"acsard {head.version}"}
     with file.open("wb") as stream:
@@ -136,24 +104,22 @@ class _McapFile:
 
         self._writer, self._namespace = Writer(stream), namespace
         self._schemas: dict[str, int] = {}
-        self._written = Written()
+        self._channels: dict[tuple[str, str], int] = {}  # by name and source
+        self._counts: Counter[int] = Counter()  # messages of each channel
         self._writer.start("ros2", f"acsard {version()}")
         self._writer.add_metadata("acsard export", origin)
 
     def add(self, message: Published) -> None:
-        channel, written = message.channel, self._written
-        topic = written.topics.get((channel.name, message.source))
-        if topic is None:
-            topic = self._open(channel, message.source)
+        which = message.channel.name, message.source
+        if which not in self._channels:
+            self._channels[which] = self._open(message.channel, message.source)
+        number = self._channels[which]
+        self._counts[number] += 1
         at_ns = max(0, message.wall_ns)  # MCAP cannot store times before 1970
-        topic.count += 1
-        data = channel.encode(message.message)
-        self._writer.add_message(topic.number, at_ns, data, at_ns, topic.count)
-        written.first_ns = min(written.first_ns, at_ns) if written.count else at_ns
-        written.last_ns = max(written.last_ns, at_ns)
-        written.count += 1
+        data = message.channel.encode(message.message)
+        self._writer.add_message(number, at_ns, data, at_ns, self._counts[number])
 
-    def _open(self, channel: Channel, source: str) -> BagTopic:
+    def _open(self, channel: Channel, source: str) -> int:
         kind = channel.schema_name
         if kind not in self._schemas:
             text = channel.schema.encode()
@@ -163,13 +129,11 @@ class _McapFile:
         if kind in TYPE_HASHES:
             about["topic_type_hash"] = TYPE_HASHES[kind]
         name = channel.topic(self._namespace, source)
-        number = self._writer.register_channel(name, ENCODING, self._schemas[kind], about)
-        topic = self._written.topics[channel.name, source] = BagTopic(name, channel, number)
-        return topic
+        return self._writer.register_channel(name, ENCODING, self._schemas[kind], about)
 
-    def finish(self) -> Written:
+    def finish(self) -> int:
         self._writer.finish()
-        return self._written
+        return self._counts.total()
 
 
 def offered_qos(qos: Qos) -> str:
@@ -188,49 +152,6 @@ def offered_qos(qos: Qos) -> str:
             "",
         ]
     )
-
-
-def bag_metadata(file: str, written: Written) -> str:
-    """Return the `metadata.yaml` of a ROS bag with one MCAP file.
-
-    Format version 5 with numeric QoS policies is read by every ROS 2 release since Humble.
-    """
-    begins = f"nanoseconds_since_epoch: {written.first_ns}"
-    lasts = f"nanoseconds: {written.last_ns - written.first_ns}"
-    lines = [
-        "rosbag2_bagfile_information:",
-        "  version: 5",
-        "  storage_identifier: mcap",
-        f"  duration: {{{lasts}}}",
-        f"  starting_time: {{{begins}}}",
-        f"  message_count: {written.count}",
-        "  topics_with_message_count:",
-    ]
-    for topic in written.topics.values():
-        lines += [
-            "    - topic_metadata:",
-            f"        name: {_quoted(topic.name)}",
-            f"        type: {_quoted(topic.channel.schema_name)}",
-            "        serialization_format: cdr",
-            f"        offered_qos_profiles: {_quoted(offered_qos(topic.channel.qos))}",
-            f"      message_count: {topic.count}",
-        ]
-    lines += [
-        '  compression_format: ""',
-        '  compression_mode: ""',
-        f"  relative_file_paths: [{_quoted(file)}]",
-        "  files:",
-        f"    - path: {_quoted(file)}",
-        f"      starting_time: {{{begins}}}",
-        f"      duration: {{{lasts}}}",
-        f"      message_count: {written.count}",
-    ]
-    return "\n".join(lines) + "\n"
-
-
-def _quoted(text: str) -> str:
-    # A name or a path may contain YAML syntax. A JSON string is also a YAML string.
-    return msgspec.json.encode(text).decode()
 
 
 # The table

@@ -47,7 +47,6 @@ def export(where: Path, *words: str) -> int:
     [
         ((), "000007-20270115T080000Z.mcap"),
         (("--csv",), "000007-20270115T080000Z.csv"),
-        (("--rosbag2",), "000007-20270115T080000Z.rosbag2"),
     ],
 )
 def test_the_newest_recording_is_exported_to_a_named_file_in_the_working_directory(
@@ -84,7 +83,7 @@ def test_another_configuration_computes_the_odometry_again(where: Path, here: Pa
 # calibrate
 
 
-@each("words", ["y.pdf", "y.csv", "y.mcap --csv", "y.mcap --rosbag2"])
+@each("words", ["y.pdf", "y.csv", "y.mcap --csv"])
 def test_a_name_with_the_ending_of_another_kind_is_refused(
     words: str, where: Path, here: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
