@@ -46,6 +46,7 @@ VARYING = (
 
 def recordings(where: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Make two recordings, of which the second is cut and damaged, and one that is none."""
+    monkeypatch.setattr("acsard.cli.recording.version", lambda: "0.2.0")  # of the tapes
     (where / "ring").mkdir()
     for number, seconds in ((1, 2.0), (2, 4.0)):
         tape = Tape(every=200)
