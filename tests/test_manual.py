@@ -32,7 +32,7 @@ QUESTIONS = {
     "How do I undo an upgrade?": ("howto/upgrade.md", "service rollback"),
     "What happened at 14:05?": ("howto/what-happened.md", "show --from 14:05"),
     "How do I let a phone drive?": ("howto/phone.md", "invite operator"),
-    "Why can `ros2 topic pub` not drive?": ("howto/ros-drive.md", "it sends no zero"),
+    "Why can `ros2 topic pub` not drive?": ("howto/ros-drive.md", "never sends a zero"),
     "How do I stop all robots?": ("howto/fleet-all.md", "acsard call stop --id"),
     "How do I let a laptop in?": ("howto/access.md", "tls init"),
     "Which role may clear a stop?": ("reference/keys.md", "| operator | all of viewer"),

@@ -418,7 +418,7 @@ def test_the_manual_has_every_ros_key_with_its_default() -> None:
 
 
 def test_the_manual_names_every_topic_and_service() -> None:
-    text = manual("reference/ros-topics")
+    text = manual("reference/ros")
     for row in ros_names():
         if not row.type.startswith("rcl_interfaces/"):
             assert f"`{row.name}`" in text, row.name
@@ -429,7 +429,7 @@ def test_the_manual_starts_a_bridge_over_the_network_below_the_robot_s_namespace
 
     A bridge without this namespace would show ROS nothing of the robot.
     """
-    lines = re.findall(r"^zenoh-bridge-ros2dds .*-e .*$", manual("howto/bridge"), re.M)
+    lines = re.findall(r"^zenoh-bridge-ros2dds .*-e .*$", manual("howto/ros"), re.M)
     assert lines
     assert all(" -n /robot1" in line for line in lines)
 

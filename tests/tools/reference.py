@@ -301,7 +301,7 @@ def metrics() -> str:
 
 
 def ros() -> str:
-    """Return the ROS names."""
+    """Return the table of the ROS names."""
     found: dict[str, tuple[str, str, list[str]]] = {}
     for row in ros_names():
         found.setdefault(row.name, (row.direction, row.native, []))[2].append(row.type)
@@ -309,12 +309,7 @@ def ros() -> str:
         (f"`{name}`", direction, " or ".join(types), f"`{native}`")
         for name, (direction, native, types) in found.items()
     )
-    return _page(
-        "ROS names",
-        "The robot has these names in ROS 2, below `[ros] namespace`. `acsard topics --ros` prints "
-        "those of your configuration.",
-        table(("name", "direction", "type", "key of the bus"), rows),
-    )
+    return table(("name", "direction", "type", "key of the bus"), rows)
 
 
 def promises() -> str:
@@ -336,7 +331,6 @@ GENERATED: dict[str, Callable[[], str]] = {
     f"{PAGES}/python.md": python_client,
     f"{PAGES}/codes.md": codes,
     f"{PAGES}/http.md": http,
-    f"{PAGES}/ros.md": ros,
     f"{PAGES}/promises.md": promises,
 }
 """Maps each generated page to the function that writes it."""

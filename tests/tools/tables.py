@@ -11,7 +11,6 @@ from pathlib import Path
 
 from acsard.core.config.settings import Config
 from acsard.core.messages.keys_and_roles import (
-    PLAIN_SERVICES,
     PUBLISHED,
     TOPICS,
     Topic,
@@ -29,7 +28,7 @@ from acsard.core.messages.permissions import (
 from acsard.core.ros.transports import ros_names
 from acsard.core.values import ROLES, Role
 from acsard.machine.router_file import EXAMPLE_ROBOT
-from tests.tools.reference import GENERATED, table
+from tests.tools.reference import GENERATED, ros, table
 
 ROOT = Path(__file__).parents[2]
 
@@ -112,7 +111,7 @@ def _rule_keys() -> dict[str, list[str]]:
     return {rule: list(dict.fromkeys(keys)) for rule, keys in rules.items()}
 
 
-# the file of the bridge, and further rows of the pages
+# the file of the bridge
 
 
 def bridge_file(text: str) -> str:
@@ -127,12 +126,6 @@ def bridge_file(text: str) -> str:
         lines = "".join(f'          "/{name}",\n' for name in dict.fromkeys(rows))
         text = _replaced(rf'(^ *{kind}: \[\n)(?: *"[^"\n]*",\n)*', lines, text)
     return text
-
-
-def ros_page(text: str) -> str:
-    """Return the page about ROS with the services that ROS can call."""
-    verbs = ", ".join(f"`acsard/{verb}`" for verb in PLAIN_SERVICES)
-    return _replaced(r"(^\| )(?:`acsard/\w+`(?:, )?)+(?= \| std_srvs/Trigger \|)", verbs, text)
 
 
 # all files
@@ -156,7 +149,7 @@ def _replaced(pattern: str, part: str, text: str) -> str:
 
 FILES: dict[str, Callable[[str], str]] = {
     "deploy/manual/pages/reference/keys.md": _marked("keys", keytable()),
-    "deploy/manual/pages/reference/ros-topics.md": ros_page,
+    "deploy/manual/pages/reference/ros.md": _marked("names", ros()),
     "deploy/ros2/zenoh-bridge-ros2dds.json5": bridge_file,
     "deploy/zenoh/router.json5": router_file,
     **{name: _whole(write) for name, write in GENERATED.items()},
