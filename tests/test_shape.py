@@ -221,6 +221,6 @@ def test_the_names_of_events_are_a_closed_set_that_the_manual_lists() -> None:
     texts = "".join(text for module, text in code().items() if module != "core/values.py")
     assert not {n for n in {*events} - {*get_args(Verb)} if f'"{n}"' not in texts}
     page = (ROOT / "deploy/manual/pages/reference/events.md").read_text(encoding="utf-8")
-    table = page.partition("| meaning | event |")[2].partition("\n\n")[0]
-    cells = [row.split("|")[2] for row in table.splitlines()[2:]]
+    table = page.partition("| event | level | meaning |")[2].partition("\n\n")[0]
+    cells = [row.split("|")[1] for row in table.splitlines()[2:]]
     assert re.findall(r"`(\w+)`", "".join(cells)) == list(events)
