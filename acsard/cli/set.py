@@ -16,6 +16,7 @@ import tomllib
 from collections.abc import Sequence
 
 import msgspec
+from msgspec.structs import replace
 
 from acsard.cli.connection import SEVERAL_IDS, add_bus, connected_to_many, several_ids
 from acsard.cli.replies import of_each, print_each
@@ -27,8 +28,9 @@ from acsard.core.messages.encodings import encode
 from acsard.core.messages.schema import ServiceReply
 from acsard.core.ros.parameters import described
 from acsard.core.values import Plain
-from acsard.host.errors import Exit, UsageError
-from acsard.machine.kept_settings import set_and_keep
+from acsard.host.config_file import change, writable
+from acsard.host.errors import Exit, MendableError, UsageError
+from acsard.host.processes import config_of, is_daemon_here
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -63,7 +65,7 @@ def main(args: argparse.Namespace) -> int:
         if many:
             return _set_all(robot, many, settings, as_json=args.json)
         if args.keep:
-            reply = set_and_keep(robot, args.config, settings)
+            reply = _set_and_keep(robot, args.config, settings)
             text = reply.message
         else:
             reply = robot.set(settings)
@@ -105,6 +107,37 @@ def _require_for_many(args: argparse.Namespace, settings: dict[str, Plain]) -> N
             f"--keep changes only the file of the robot on which it is typed, but --id '{args.id}' "
             "names several robots: type the command on each robot"
         )
+
+
+def _set_and_keep(
+    robot: Connection, config: str | None, settings: dict[str, Plain]
+) -> ServiceReply:
+    # Nothing is set if the file cannot be written. `config` is its path, or None.
+    if any(key.startswith("commands.sources.") for key in settings):
+        raise UsageError(
+            "[[commands.sources]] cannot be kept: set the timeout without keeping it, and "
+            "write it into the file yourself. If the file has no [[commands.sources]] yet, copy "
+            "all of these tables from the output of `acsard check` first, because the file's "
+            "tables replace all built-in ones"
+        )
+    pid = robot.get("info").pid
+    if not is_daemon_here(pid):
+        raise MendableError(
+            "no setting was changed: only a program on the robot can write its file, but the "
+            "daemon runs on another machine or in a container: type `acsard set --keep` there"
+        )
+    file = writable(config)
+    reply = robot.set(settings)
+    if not reply.success:
+        return reply
+    try:
+        change(file, settings)
+    except MendableError as error:
+        raise MendableError(f"{reply.message}; not written: {error}") from None
+    text, used = f"{reply.message}; written to {file}", config_of(pid)
+    if used is not None and used.resolve() != file.resolve():
+        text += f", but the daemon uses {used}: start it with `--config {file}`"
+    return replace(reply, message=text)
 
 
 def _with_duration(reply: ServiceReply) -> ServiceReply:

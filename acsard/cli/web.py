@@ -151,7 +151,6 @@ def main(args: argparse.Namespace) -> int:
         listen,
         tls,
         tokens.place(),
-        args.config,
         args.supervised,
     )
     log = Log(config.log)

@@ -65,28 +65,24 @@ def problem(status: int, text: str, detail: str = "") -> web.Response:
 
 
 def file_answer(request: web.Request, file: File) -> web.Response:
-    """Return a file, as gzip if the client takes it, or 304 if it has this version."""
-    headers = file_headers(request, file.tag, file.policy)
-    if request.headers.get("If-None-Match") == file.tag:
-        return web.Response(status=304, headers=headers)
-    body = file.body
-    if file.packed is not None and "gzip" in request.headers.get("Accept-Encoding", ""):
-        body, headers["Content-Encoding"] = file.packed, "gzip"
-    return web.Response(body=body, headers=headers | {"Content-Type": file.kind})
+    """Return a file, as gzip if the client takes it, or 304 if it has this version.
 
-
-def file_headers(request: web.Request, tag: str, policy: str) -> dict[str, str]:
-    """Return the headers of a file with this version, also of an answer with the status 304.
-
-    Such an answer contains the policy too, because the browser uses it in place of the policy that
-    it has stored with the file. `policy` is appended to that of all answers.
+    The latter contains the policy too, because the browser uses it in place of the policy that it
+    has stored with the file.
     """
-    return {
-        "ETag": tag,
+    headers = {
+        "ETag": file.tag,
         "Cache-Control": "no-cache",
         "Vary": "Accept-Encoding",
-        "Content-Security-Policy": _policy(request, policy),
+        "Content-Security-Policy": _policy(request, file.policy),
     }
+    if request.headers.get("If-None-Match") == file.tag:
+        return web.Response(status=304, headers=headers)
+    if "gzip" in request.headers.get("Accept-Encoding", ""):
+        body, headers["Content-Encoding"] = file.packed, "gzip"
+    else:
+        body = gzip.decompress(file.packed)
+    return web.Response(body=body, headers=headers | {"Content-Type": file.kind})
 
 
 def cut(transport: asyncio.BaseTransport | None) -> None:
@@ -156,11 +152,10 @@ INLINED = {
 
 
 class File(Struct, frozen=True):
-    """A file of the page in the form in which it is sent."""
+    """A file of the page or the manual in the form in which it is sent."""
 
     kind: str
-    body: bytes
-    packed: bytes | None  # gzip; None if that is not shorter
+    packed: bytes  # gzip
     tag: str
     policy: str  # Appended to `POLICY`: allows the inserted scripts and styles.
 
@@ -185,7 +180,5 @@ def _load_file(path: Path, kind: str) -> File:
         body = body.replace(loads, f"<{element}>".encode() + source + f"</{element}>".encode())
         digest = base64.b64encode(hashlib.sha256(source).digest()).decode()
         policy += f"; {element}-src 'self' 'sha256-{digest}'"
-    # Compression does not pay for a small file.
-    packed = gzip.compress(body, mtime=0) if len(body) >= 1000 else body
     tag = f'"{hashlib.sha256(body).hexdigest()[:32]}"'
-    return File(kind, body, packed if len(packed) < len(body) else None, tag, policy)
+    return File(kind, gzip.compress(body, mtime=0), tag, policy)

@@ -10,11 +10,11 @@ import asyncio
 import socket
 from collections.abc import Mapping
 from collections.abc import Set as AbstractSet
-from typing import Annotated, Any
+from typing import Any
 
 import msgspec
 from aiohttp import web
-from msgspec import UNSET, Meta, Struct, UnsetType, inspect
+from msgspec import UNSET, Struct, UnsetType, inspect
 
 from acsard import __version__
 from acsard.bus.zenoh_sessions import MAX_MESSAGE_BYTES
@@ -26,14 +26,13 @@ from acsard.core.ros.parameters import kind_of
 from acsard.core.values import Role
 from acsard.host import clock
 from acsard.host.errors import MendableError, NoAnswerError
-from acsard.machine.kept_settings import can_be_kept
 from acsard.web import metrics, openapi
 from acsard.web.access import IDENTITY_KEY, Access, connection_of, own_port, peer_of
-from acsard.web.answers import TroubleError, file_answer, page_files, reply
+from acsard.web.answers import File, TroubleError, file_answer, page_files, reply
 from acsard.web.callers import PROTOCOL, RequestRefusedError, cookie_name, tokens_offered
 from acsard.web.camera import Camera
 from acsard.web.connections import Connections
-from acsard.web.manual import Manual
+from acsard.web.manual import MISSING, manual_files
 from acsard.web.recordings import BlackBox, Recording
 from acsard.web.routes import JSON, RECORDINGS_ROLE, Body, Problem, Route, services, values
 from acsard.web.streams import as_json
@@ -69,7 +68,6 @@ class Setting(Struct, frozen=True, omit_defaults=True):
     what: str
     when: str
     unit: str = ""
-    keep: Annotated[bool, Meta(description="whether `keep` can write it into the file")] = True
     low: float | UnsetType = UNSET
     high: float | UnsetType = UNSET
     choices: list[str] | UnsetType = UNSET
@@ -90,7 +88,7 @@ class Page:
         rules: WebConfig,
     ) -> None:
         self._parts, self._tokens, self._connections = parts, tokens, connections
-        self._robot, self._files, self._manual = parts.robot, page_files(), Manual()
+        self._robot, self._files, self._manual = parts.robot, page_files(), manual_files()
         self._box = BlackBox(parts.robot)
         self._camera = Camera(rules.camera)
         self._has_camera = bool(rules.camera)
@@ -114,25 +112,21 @@ class Page:
     # The page and its files.
 
     async def index(self, request: web.Request) -> web.StreamResponse:
-        return await self._send(request, "index.html")
+        return _send(request, self._files, "index.html")
 
     async def icon(self, request: web.Request) -> web.StreamResponse:
-        return await self._send(request, "icon.svg")
+        return _send(request, self._files, "icon.svg")
 
     async def file(self, request: web.Request) -> web.StreamResponse:
-        return await self._send(request, request.match_info["name"])
-
-    async def _send(self, request: web.Request, name: str) -> web.StreamResponse:
-        file = self._files.get(name)
-        if file is None:
-            raise web.HTTPNotFound
-        return file_answer(request, file)
+        return _send(request, self._files, request.match_info["name"])
 
     async def manual_place(self, request: web.Request) -> web.StreamResponse:
         raise web.HTTPFound("/docs/")  # the links of a page are relative to its directory
 
     async def manual(self, request: web.Request) -> web.StreamResponse:
-        return await self._manual.answer(request, request.match_info["file"])
+        if not self._manual:
+            return web.Response(status=404, body=MISSING, content_type="text/html")
+        return _send(request, self._manual, request.match_info["file"] or "index.html")
 
     async def token(self, request: web.Request) -> web.StreamResponse:
         """Return the token of the body in a cookie that no script can read.
@@ -261,6 +255,13 @@ class Page:
             ) from None
 
 
+def _send(request: web.Request, files: Mapping[str, File], name: str) -> web.StreamResponse:
+    file = files.get(name)
+    if file is None:
+        raise web.HTTPNotFound
+    return file_answer(request, file)
+
+
 def settings_in(config: Mapping[str, Any]) -> list[Setting]:
     """Return the settings that may change while the daemon runs."""
     return [
@@ -271,7 +272,7 @@ def settings_in(config: Mapping[str, Any]) -> list[Setting]:
 
 
 def _described(key: str) -> dict[str, Any]:
-    found: dict[str, Any] = {"keep": can_be_kept(key)}
+    found: dict[str, Any] = {}
     kind = kind_of(key)
     if isinstance(kind, inspect.Metadata):
         found["unit"] = (kind.extra or {}).get("unit", "")

@@ -18,7 +18,6 @@ from acsard.core.messages.permissions import least_role
 from acsard.core.messages.schema import ServiceReply
 from acsard.host.errors import MendableError, NoAnswerError, UsageError
 from acsard.host.threads import in_thread
-from acsard.machine.kept_settings import set_and_keep
 from acsard.web.callers import AdmittedClient, RequestRefusedError
 from acsard.web.followed_robot import FollowedRobot
 
@@ -29,8 +28,8 @@ ANSWER_TIMEOUT_S = 8.0
 class Calls:
     """The calls of all clients of the page, over one connection to the robot."""
 
-    def __init__(self, robot: FollowedRobot, config: str | None = None) -> None:
-        self._robot, self._config = robot, config
+    def __init__(self, robot: FollowedRobot) -> None:
+        self._robot = robot
         self._stops: dict[str, _Stops] = {}
 
     async def call(
@@ -48,7 +47,7 @@ class Calls:
         try:
             if verb == "stop":
                 return await self._stops.setdefault(client.name, _Stops()).send(client)
-            reply = await in_thread(lambda: self._request(client, verb, payload), ANSWER_TIMEOUT_S)
+            reply = await in_thread(lambda: client.request(verb, payload), ANSWER_TIMEOUT_S)
         except (NoAnswerError, TimeoutError):
             return ServiceReply(False, unanswered(verb))
         except (MendableError, UsageError, DecodeError) as error:
@@ -66,15 +65,6 @@ class Calls:
         if client is None:
             raise MendableError(self._robot.gone)
         return await in_thread(lambda: client.reply(f"{name}?fmt=json"), ANSWER_TIMEOUT_S)
-
-    def _request(self, client: Connection, verb: str, payload: Mapping[str, Any]) -> ServiceReply:
-        if verb != "set" or "keep" not in payload:
-            return client.request(verb, payload)
-        arguments = dict(payload)
-        keep, settings = arguments.pop("keep"), arguments.get("settings")
-        if keep is True and isinstance(settings, dict):
-            return set_and_keep(client, self._config, settings)
-        return client.request(verb, arguments)
 
 
 class _Stops:

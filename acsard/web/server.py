@@ -51,7 +51,6 @@ class ServerOptions(Struct, frozen=True):
     listen: tuple[Listen, ...]
     tls: str  # directory of the robot's certificate, or ""
     state: Path  # directory of the token file
-    file: str | None = None  # the robot's configuration file; None for the usual places
     # started by the daemon: may use a later port, and ends when its standard input closes
     supervised: bool = False
 
@@ -81,7 +80,7 @@ async def serve(
     robot = FollowedRobot(
         options.address, lambda: _connected(options.address), _about(options), counts
     )
-    parts = Parts(robot, counts, options.file)
+    parts = Parts(robot, counts)
     tokens = ReadTokens(Vault(options.state, options.address.robot_id))
     connections = Connections(counts)
     page = Page(parts, tokens, names, connections, options.config.web)

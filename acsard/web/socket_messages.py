@@ -179,8 +179,6 @@ class Greeting(Struct, frozen=True):
     is the name of a service, "drive" or "recordings"."""
     camera: bool
     """True if a camera is configured. The path `/api/camera` then returns its pictures."""
-    unused: str
-    """A version that is installed on this machine and newer than the one in use, or ""."""
 
 
 class Hello(Struct, frozen=True):

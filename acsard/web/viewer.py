@@ -19,7 +19,6 @@ from acsard.core.values import Role, Twist
 from acsard.host import clock
 from acsard.host.own_identity import sender_id
 from acsard.host.rate_limits import Bucket
-from acsard.machine import versions
 from acsard.web import socket_messages
 from acsard.web.access import FLOOD_TEXT, REQUEST_RATE
 from acsard.web.callers import AdmittedClient, RequestRefusedError
@@ -55,10 +54,10 @@ PING_INTERVAL_S = 10.0
 class Parts:
     """What `Page` and all viewers share, such as the connection to the daemon."""
 
-    def __init__(self, robot: FollowedRobot, counts: Counts, config: str | None = None) -> None:
+    def __init__(self, robot: FollowedRobot, counts: Counts) -> None:
         self.robot, self.counts = robot, counts
         self.outbox = Outbox(lambda: robot.client, counts)
-        self.calls = Calls(robot, config)
+        self.calls = Calls(robot)
 
 
 class Viewer:
@@ -237,7 +236,6 @@ class Viewer:
                 if not self.who.may(least)
             },
             self._camera,
-            versions.unused(),
         )
         if greeting != self._greeting:
             self._greeting = greeting

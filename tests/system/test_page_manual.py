@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from acsard.web.manual import Manual
+from acsard.web.manual import manual_files
 from deploy.manual.build import build
 from tests.system.chromium import CHROMIUM, DESKTOP, browsing
 from tests.system.harness import until
@@ -30,7 +30,7 @@ async def test_the_page_leads_to_the_manual_whose_links_and_search_work(tmp_path
     archive = tmp_path / "manual.zip"
     await asyncio.to_thread(build, archive)
     whole = Whole(tmp_path)
-    whole.page._manual = Manual(archive)
+    whole.page._manual = manual_files(archive)
 
     def look(page: str) -> None:
         with browsing() as browser:

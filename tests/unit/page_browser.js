@@ -202,7 +202,7 @@ export const robot = {
   refusal: null, // the status and the reason with which it refuses this browser
   hello: {
     robot: "acsar", role: "maintainer", sender: "here/00112233445566aa", simulated: true, limits: { linear: 1, angular: 4 },
-    barred: {}, camera: false, state_rate: 10, unused: "",
+    barred: {}, camera: false, state_rate: 10,
   },
   state: {
     mode: "ready", code: "no_command", reason: "", link: "up", source: "", sender: "", causes: [], x: 0, y: 0, yaw: 0,

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import threading
-import tomllib
 from copy import copy
 from pathlib import Path
 from types import SimpleNamespace
@@ -21,7 +20,7 @@ from acsard.client.connection import Connection
 from acsard.core.config.live import LIVE
 from acsard.core.config.parsing import effective
 from acsard.core.config.settings import Config, WebConfig
-from acsard.core.messages.schema import Change, Info, ReplyData, ServiceReply
+from acsard.core.messages.schema import ServiceReply
 from acsard.core.values import NS_PER_S, Role
 from acsard.host import clock
 from acsard.host.errors import NoAnswerError
@@ -110,51 +109,6 @@ async def test_a_call_without_a_daemon_is_answered_with_a_plain_sentence(verb: s
     assert reply == ServiceReply(
         False, f"the robot's daemon does not answer, so `{verb}` is not confirmed: does it run?"
     )
-
-
-class KeepingRobot:
-    """A daemon on this machine that sets everything, as the connection of the page."""
-
-    id, gone = "acsar", ""
-
-    def __init__(self) -> None:
-        self.client, self.asked = self, list[object]()
-
-    def named(self, name: str) -> KeepingRobot:
-        return self
-
-    def get(self, key: str) -> Info:
-        return Info("acsar", "0", 1, "sim", True, 100.0, [], [])
-
-    def set(self, settings: object) -> ServiceReply:
-        return self.request("set", {"settings": settings})
-
-    def request(self, verb: str, fields: object) -> ServiceReply:
-        self.asked.append(fields)
-        return ServiceReply(True, "done", ReplyData(changes={"rates.telemetry": Change(10.0, 5.0)}))
-
-    def refresh_about(self) -> None: ...
-
-
-async def test_keep_writes_the_file_of_the_page_or_says_why_it_may_not(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    robot, file = KeepingRobot(), tmp_path / "robot.toml"
-    monkeypatch.setattr("acsard.machine.kept_settings.is_daemon_here", lambda pid: True)
-    here = AdmittedClient("maintainer", "here")
-    calls, wish = Calls(cast(Any, robot), str(file)), {"settings": {"rates.telemetry": 5}}
-    file.touch(0o444)
-    refused = await calls.call(here, "set", wish | {"keep": True})
-    assert "it is read-only" in refused.message
-    assert not refused.success
-    assert not robot.asked
-    file.chmod(0o644)
-    kept = await calls.call(here, "set", wish | {"keep": True})
-    assert kept == replace(robot.request("", wish), message=f"done; written to {file}")
-    del robot.asked[-1]
-    assert tomllib.loads(file.read_text()) == {"rates": {"telemetry": 5}}
-    assert (await calls.call(here, "set", wish | {"keep": False})).message == "done"
-    assert robot.asked == [wish, wish]
 
 
 ABOUT = About("1", True, 1.0, 4.0, 10.0, "", {"teleop": 0.25, "app": 0.25})
@@ -264,5 +218,3 @@ def test_a_row_has_its_value_its_unit_its_range_and_when_it_may_change() -> None
     assert row.low <= row.value <= row.high
     assert row.when == "at any time"
     assert "stands" in ROWS["limits.wheel_speed"].when
-    assert row.keep
-    assert not ROWS["commands.sources.app.timeout"].keep

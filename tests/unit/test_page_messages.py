@@ -119,7 +119,7 @@ def test_any_text_decodes_or_raises_a_frame_error(text: str) -> None:
 
 GREETING = socket_messages.Greeting(
     "acsar", "1", "operator", "phone/1f", socket_messages.Limits(1.0, 4.0), True, 10.0,
-    {"set": "for maintainers; your role is operator"}, False, "",
+    {"set": "for maintainers; your role is operator"}, False,
 )  # fmt: skip
 
 SAID: tuple[Struct, ...] = (

@@ -82,7 +82,7 @@ def test_keep_writes_the_file_of_the_robot_on_which_it_is_typed(
     file = tmp_path / "robot.toml"
     file.write_text("# mine\n")
     monkeypatch.setattr("acsard.cli.connection.open_connection", lambda *words, **more: Robot())
-    monkeypatch.setattr("acsard.machine.kept_settings.is_daemon_here", lambda pid: True)
+    monkeypatch.setattr("acsard.cli.set.is_daemon_here", lambda pid: True)
     assert main(["set", "rates.telemetry", "5", "--keep", "--config", str(file)]) == 0
     assert capsys.readouterr().out == f"rates.telemetry = 5.0 (was 10.0); written to {file}\n"
     assert "# mine\n" in file.read_text()
@@ -128,9 +128,7 @@ def test_keep_sets_nothing_if_it_cannot_write_the_file(
         file.touch(0o444 if why == "it is read-only" else 0o644)
     monkeypatch.setattr("acsard.host.config_file.SEARCH_PATHS", (file,))
     monkeypatch.setattr("acsard.cli.connection.open_connection", lambda *words, **more: robot)
-    monkeypatch.setattr(
-        "acsard.machine.kept_settings.is_daemon_here", lambda pid: why != "another machine"
-    )
+    monkeypatch.setattr("acsard.cli.set.is_daemon_here", lambda pid: why != "another machine")
     assert main(["set", "rates.telemetry", "5", "--keep"]) == 1
     assert why in capsys.readouterr().err
     assert not robot.settings

@@ -280,7 +280,7 @@ function greeted(message) {
   $("tab-set").hidden = !settable();
   if (view === "set" && !settable()) open("drive");
   $("simulated").hidden = !hello.simulated;
-  $("role").textContent = hello.role + (hello.unused && ` · version ${hello.unused} is installed, not in use`);
+  $("role").textContent = hello.role;
   drive.sender = hello.sender;
   camera.show(hello.camera);
   drive.limits = hello.limits;

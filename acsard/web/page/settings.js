@@ -3,14 +3,14 @@
 import { made } from "./views.js";
 import { number } from "./words.js";
 
-/** Show `rows` of {key, value, what, when, unit, keep, low, high, choices} in `place`. `call(payload)` changes a setting
+/** Show `rows` of {key, value, what, when, unit, low, high, choices} in `place`. `call(payload)` changes a setting
  *  and shows the outcome. */
 export function show(place, rows, call) {
   if (place.contains(document.activeElement) && document.activeElement.tagName === "INPUT") return;
   place.replaceChildren(...rows.map((row, n) => shown(row, `set-${n}`, call)));
 }
 
-function shown({ key, value, what, when, unit = "", keep = true, low, high, choices }, id, call) {
+function shown({ key, value, what, when, unit = "", low, high, choices }, id, call) {
   unit = unit.replace("2", "²").replace("3", "³");
   const range = low === undefined ? "" : `; ${low} to ${high} ${unit}`;
   // Allow a narrow screen to break a key at its dots and underscores.
@@ -21,16 +21,12 @@ function shown({ key, value, what, when, unit = "", keep = true, low, high, choi
   field.id = id;
   if (!choices) field.inputMode = typeof value === "number" ? "decimal" : "text";
   field.value = value;
-  const send = (more) => call({ settings: { [key]: read(field.value, value) }, ...more });
-  field.addEventListener("keydown", (event) => event.key === "Enter" && send({}));
-  const button = (words, more) => {
-    const element = made("button", "", words);
-    element.setAttribute("aria-label", `${words} ${key}`);
-    element.addEventListener("click", () => send(more));
-    return element;
-  };
-  const keeper = keep ? button("Keep", { keep: true }) : made("span");
-  return made("div", "", label, field, made("span", "quiet", unit.split(" ")[0]), button("Set", {}), keeper);
+  const send = () => call({ settings: { [key]: read(field.value, value) } });
+  field.addEventListener("keydown", (event) => event.key === "Enter" && send());
+  const button = made("button", "", "Set");
+  button.setAttribute("aria-label", `Set ${key}`);
+  button.addEventListener("click", send);
+  return made("div", "", label, field, made("span", "quiet", unit.split(" ")[0]), button);
 }
 
 /** Convert the typed text to the type of the present value `before`. A text that does not fit is returned unchanged,
