@@ -175,3 +175,15 @@ def test_a_late_plain_subscriber_gets_tf_static_within_6_s(late: Late) -> None:
     assert entry.at - late.since < 6.0
     assert entry.encoding == "application/msgpack;acsard.TFMessage.v1"
     assert entry.value["transforms"][0]["child_frame_id"] == "lidar_link"
+
+
+@each(
+    ("asked", "types"),
+    [("schema/Odo$*", {"Odometry"}), ("*/Odometry", {"Odometry"}), ("schema/*/Odometry", set())],
+)
+def test_a_wildcard_gets_the_schemas_that_it_includes(
+    asked: str, types: set[str], shared: Daemon
+) -> None:
+    with Bus(shared.endpoint) as bus:
+        replies = [reply.ok for reply in bus.session.get(f"{bus.root}/{asked}", timeout=5.0)]
+    assert {str(reply.key_expr).rpartition("/")[2] for reply in replies if reply} == types

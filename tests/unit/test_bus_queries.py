@@ -157,25 +157,17 @@ def test_each_type_has_a_schema(name: str) -> None:
     assert msgspec.json.decode(reply.payload) == SCHEMAS[name]
 
 
-@each(
-    ("asked", "types"),
-    [
-        *((asked, list(SCHEMAS)) for asked in ("schema/*", "schema/**", "**")),
-        ("acsard/*/schema/*", list(SCHEMAS)),
-        ("schema/Odo$*", [name for name in SCHEMAS if name.startswith("Odo")]),
-        ("schema/$*met$*", [name for name in SCHEMAS if "met" in name[1:-1]]),
-        *((asked, ["Odometry"]) for asked in (
-            "schema/O$*m$*t$*y", "schema/Odometry/**", "*/Odometry", "**/Odometry",
-            "acsard/*/schema/Odometry")),
-        *((asked, []) for asked in (
-            "schema/Odometry$*y", "schema/*/Odometry", "acsard/*/state/*",
-            "**/" + "$*a" * 10_000, "schema/", "schema/Nothing", "schema/odometry",
-            "schema/Odometry/x", "schema/<Type>")),
-    ],
-)  # fmt: skip
-def test_a_wildcard_gives_the_schemas_whose_keys_it_includes(asked: str, types: list[str]) -> None:
+@each("asked", ["schema/*", "**", "acsard/*/schema/*", "schema/Odo$*", "**/" + "$*a" * 10_000])
+def test_a_wildcard_gets_all_schemas_of_which_zenoh_sends_those_that_it_includes(
+    asked: str,
+) -> None:
     replies = answers(query("schema/<Type>", asked))
-    assert [reply.key for reply in replies] == [f"schema/{name}" for name in types]
+    assert [reply.key for reply in replies] == [f"schema/{name}" for name in SCHEMAS]
+
+
+@each("asked", ["schema/", "schema/Nothing", "schema/odometry", "schema/Odometry/x"])
+def test_an_unknown_type_has_no_schema(asked: str) -> None:
+    assert answers(query("schema/<Type>", asked)) == []
 
 
 @each(

@@ -65,8 +65,6 @@ from acsard.core.values import ROLES, Answer, Ns, Request, Status, WallNs
 
 Current = Callable[[str], Message | None]
 
-MAX_WILDCARD_LENGTH = 512  # of a wildcard: no key is longer, and it would delay the control loop
-
 
 class Query(Struct, frozen=True):
     """A query as Zenoh delivered it."""
@@ -200,7 +198,9 @@ class Queries:
         topic = query.topic
         if topic == "schema/<Type>":
             keys = {f"schema/{name}": value for name, value in SCHEMAS.items()}
-            return [(key, "", value) for key, value in keys.items() if self._matches(query, key)]
+            # Zenoh sends only the replies whose key the wildcard includes.
+            asked = keys if "*" in query.asked else keys.keys() & {query.asked}
+            return [(key, "", keys[key]) for key in asked]
         if topic == WHOAMI:
             roles = [role for role in ROLES if whoami_key(role) == query.asked]
             by = caller_name(query.via, query.attachment)
@@ -214,51 +214,6 @@ class Queries:
             return [(topic, type(value).__name__ if isinstance(value, Message) else "", value)]
         value = current(topic.removeprefix(JSON_TREE))
         return [] if value is None else [(topic, type(value).__name__, value)]
-
-    def _matches(self, query: Query, key: str) -> bool:
-        # `key` is without `acsard/<id>/`.
-        if "*" not in query.asked:
-            return query.asked == key
-        if len(query.asked) > MAX_WILDCARD_LENGTH:
-            return False
-        whole = full_key(self.config.robot.id, key)
-        return includes(query.asked, key) or includes(query.asked, whole)
-
-
-def includes(expression: str, key: str) -> bool:
-    """Return whether a Zenoh key expression matches a key, without backtracking.
-
-    So no expression takes a long time.
-    """
-    chunks = key.split("/")
-    reached = {0}
-    for part in expression.split("/"):
-        if not reached:
-            return False
-        if part == "**":
-            reached = set(range(min(reached), len(chunks) + 1))
-        else:
-            reached = {n + 1 for n in reached if n < len(chunks) and _fits(part, chunks[n])}
-    return len(chunks) in reached
-
-
-def _fits(pattern: str, chunk: str) -> bool:
-    # Both are between two slashes; `$*` stands for any text.
-    if pattern == "*":
-        return True
-    first, *middle = pattern.split("$*")
-    if not middle:
-        return pattern == chunk
-    last = middle.pop()
-    if not chunk.startswith(first):
-        return False
-    at = len(first)
-    for text in middle:
-        at = chunk.find(text, at)
-        if at < 0:
-            return False
-        at += len(text)
-    return chunk.endswith(last) and at <= len(chunk) - len(last)
 
 
 def refused(query: Query, why: str, wall_ns: WallNs, encoding: str = "text/plain") -> Reply | None:
