@@ -23,7 +23,6 @@ from acsard.calibration.plan import Leg, Move
 from acsard.client.connection import Connection
 from acsard.client.driving import Driver, drive
 from acsard.client.follower import FIRST_STATE_TIMEOUT_S
-from acsard.client.reads import decoder_of
 from acsard.core.config.settings import Config
 from acsard.core.messages.encodings import DecodeError, Decoder
 from acsard.core.messages.keys_and_roles import IMU
@@ -64,7 +63,7 @@ class Sensor:
     ) -> None:  # fmt: skip
         self.key, self.columns, self._values = key, columns, values
         self._samples = Subscription(queue_on(session, key, latched=False), key)
-        self._decoders: list[Decoder[Any]] = [decoder_of(type_) for type_ in types]
+        self._decoders: list[Decoder[Any]] = [Decoder(type_) for type_ in types]
         self.rows: list[tuple[float, ...]] = []  # arrival, stamp (0 if unknown), values
 
     def receive(self, now: Seconds) -> int:

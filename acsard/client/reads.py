@@ -8,31 +8,25 @@ from contextlib import aclosing
 from functools import lru_cache, partial
 from typing import Any, Literal, TypeVar, overload
 
-from msgspec import field
-
 from acsard.bus.subscription import Subscription, encoded
-from acsard.core.messages.encodings import Decoder, Format, decode_cdr
+from acsard.core.messages.encodings import Decoder
 from acsard.core.messages.keys_and_roles import FOLLOWED, TOPICS, by_key, key_hint
 from acsard.core.messages.schema import (
     MESSAGES,
     Battery,
     Beat,
-    Covariance3,
     DiagnosticArray,
     Events,
-    Header,
     Imu,
     Info,
     Interfaces,
     JointState,
     Odometry,
     PoseStamped,
-    Quaternion,
     RobotState,
     TFMessage,
     Topics,
     TwistStamped,
-    Vector3,
 )
 from acsard.host.errors import UsageError
 
@@ -239,36 +233,9 @@ def _require(name: str, keys: set[str]) -> None:
     raise UsageError(f"{name!r} is not a key of the robot: {key_hint(name)}")
 
 
-_UNKNOWN = [0.0] * 9  # the covariance in sensor_msgs/Imu
-
-
-class _PartialImu(Imu, frozen=True, kw_only=True):
-    # In JSON and msgpack only `angular_velocity` is required.
-    header: Header = Header()
-    orientation: Quaternion = Quaternion()
-    orientation_covariance: Covariance3 = field(default_factory=_UNKNOWN.copy)
-    angular_velocity: Vector3
-    angular_velocity_covariance: Covariance3 = field(default_factory=_UNKNOWN.copy)
-    linear_acceleration: Vector3 = Vector3()
-    linear_acceleration_covariance: Covariance3 = field(default_factory=_UNKNOWN.copy)
-
-
-class _ImuDecoder(Decoder[Imu]):
-    def __init__(self) -> None:
-        super().__init__(_PartialImu)
-
-    def decode_as(self, form: Format, payload: bytes) -> Imu:
-        return decode_cdr(Imu, payload) if form == "cdr" else super().decode_as(form, payload)
-
-
-def decoder_of(kind: type) -> Decoder[Any]:
-    """Return the decoder for messages of the type `kind`."""
-    return _ImuDecoder() if kind is Imu else Decoder(kind)
-
-
 @lru_cache(maxsize=64)
 def decoder(name: str) -> Decoder[Any]:
     """Return the decoder for a key; those without a message type (config) give dictionaries."""
     topic = by_key(name)
     cls = None if topic is None else MESSAGES.get(topic.type)
-    return decoder_of(cls or dict)
+    return Decoder(cls or dict)

@@ -18,7 +18,6 @@ from acsard.core.messages.schema import (
     DiagnosticArray,
     Header,
     Imu,
-    Quaternion,
     RobotState,
     Time,
     Vector3,
@@ -119,9 +118,12 @@ class Publisher:
         header = Header(Time.from_ns(stamp_ns), self._config.odometry.base_frame)
         variances = [*[0.0] * 8, sample.variance]
         message = Imu(
-            header, Quaternion(), UNMEASURED, Vector3(z=sample.rate), variances, Vector3(),
-            UNMEASURED,
-        )  # fmt: skip
+            header=header,
+            orientation_covariance=UNMEASURED,
+            angular_velocity=Vector3(z=sample.rate),
+            angular_velocity_covariance=variances,
+            linear_acceleration_covariance=UNMEASURED,
+        )
         return Published(IMU_CHANNEL, "", arrived_ns, message)
 
     def _received(self, command: Command, now: Instant) -> Published:

@@ -18,7 +18,7 @@ from acsard.core.messages.schema import Header, SpeedLimit, Time
 from acsard.core.ros.attachments import Attachment
 from tests.each import each
 
-FULL = SpeedLimit(Header(Time(12, 5), "map"), True, 40.0)
+FULL = SpeedLimit(header=Header(Time(12, 5), "map"), percentage=True, speed_limit=40.0)
 
 
 def arrival(payload: bytes, encoding: str = "", put: bool = True, via: Via = "native") -> Arrival:
@@ -40,7 +40,7 @@ LIMITS: list[tuple[Arrival, float | str | None]] = [
     (typed(50.0, percentage=True), 0.4),
     (typed(-0.1), "out_of_range"), (typed(-5.0, percentage=True), "out_of_range"),
     (typed(100.1, percentage=True), "out_of_range"),
-    *((arrival(encode(SpeedLimit(Header(), share, value), "cdr")), "not_finite")
+    *((arrival(encode(SpeedLimit(percentage=share, speed_limit=value), "cdr")), "not_finite")
       for value in (math.nan, math.inf, -math.inf) for share in (False, True)),
     (arrival(b"{}"), "wrong_shape"), (typed("fast"), "wrong_shape"), (typed(None), "wrong_shape"),
     (typed(0.3, percent=True), "wrong_shape"), (arrival(encode(FULL, "cdr")[:-1]), "malformed"),

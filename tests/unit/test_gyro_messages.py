@@ -28,13 +28,12 @@ from tests.each import each
 
 ZEROS = [0.0] * 9
 FULL = Imu(
-    Header(Time(12, 5), "imu_link"),
-    Quaternion(0.1, 0.2, 0.3, 0.9),
-    [-1.0, *ZEROS[1:]],
-    Vector3(0.01, -0.02, 0.75),
-    [1e-4, 0.0, 0.0, 0.0, 1e-4, 0.0, 0.0, 0.0, 4e-4],
-    Vector3(0.1, 0.0, 9.81),
-    ZEROS,
+    header=Header(Time(12, 5), "imu_link"),
+    orientation=Quaternion(0.1, 0.2, 0.3, 0.9),
+    orientation_covariance=[-1.0, *ZEROS[1:]],
+    angular_velocity=Vector3(0.01, -0.02, 0.75),
+    angular_velocity_covariance=[1e-4, 0.0, 0.0, 0.0, 1e-4, 0.0, 0.0, 0.0, 4e-4],
+    linear_acceleration=Vector3(0.1, 0.0, 9.81),
 )
 
 
@@ -71,7 +70,7 @@ def test_any_payload_is_a_sample_or_is_counted_as_refused(payload: bytes) -> Non
 
 @given(st.floats(allow_nan=True, allow_infinity=True))
 def test_a_turn_rate_beyond_the_maximum_is_refused(rate: float) -> None:
-    imu = Imu(Header(), Quaternion(), ZEROS, Vector3(z=rate), ZEROS, Vector3(), ZEROS)
+    imu = Imu(angular_velocity=Vector3(z=rate))
     if abs(rate) <= MAX_RATE:
         assert reading(arrival(encode(imu, "cdr")))[0].rate == rate
         return
@@ -84,11 +83,7 @@ REFUSED: dict[str, Arrival] = {
     "wrong_shape": imu_message(linear_acceleration={"z": 9.81}),
     "malformed": arrival(encode(FULL, "cdr")[:100]),
     "unknown_encoding": arrival(b"0.5"),
-    "not_finite": arrival(
-        encode(
-            Imu(Header(), Quaternion(), ZEROS, Vector3(x=math.nan), ZEROS, Vector3(), ZEROS), "cdr"
-        )
-    ),
+    "not_finite": arrival(encode(Imu(angular_velocity=Vector3(x=math.nan)), "cdr")),
     "out_of_range": turning(50.1),
     "no_rate": imu_message(
         angular_velocity={"z": 0.1}, angular_velocity_covariance=[-1.0, *ZEROS[1:]]

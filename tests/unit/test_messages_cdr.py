@@ -160,7 +160,9 @@ TYPES: dict[type[Any], tuple[str, Any]] = {
     JointState: ("sensor_msgs/msg/JointState", st.builds(
         JointState, header, st.lists(text, max_size=5), numbers(), numbers(), numbers())),
     Imu: ("sensor_msgs/msg/Imu", st.builds(
-        Imu, header, quaternion, nine, vector, nine, vector, nine)),
+        Imu, header=header, orientation=quaternion, orientation_covariance=nine,
+        angular_velocity=vector, angular_velocity_covariance=nine, linear_acceleration=vector,
+        linear_acceleration_covariance=nine)),
     Battery: ("sensor_msgs/msg/BatteryState", st.builds(
         Battery, header, *[float32 | st.none()] * 7, *[byte] * 3, st.booleans(), cells, cells,
         text, text)),

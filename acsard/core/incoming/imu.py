@@ -11,13 +11,12 @@ from __future__ import annotations
 import math
 from collections.abc import MutableMapping
 
-from msgspec import Struct
 from msgspec.structs import replace
 
 from acsard.core.incoming.commands import Arrival, claimed_identity
-from acsard.core.messages.encodings import DecodeError, StrictDecoder, decode_cdr, detect
+from acsard.core.messages.encodings import DecodeError, StrictDecoder
 from acsard.core.messages.refusals import MAX_COMMAND_BYTES
-from acsard.core.messages.schema import Covariance3, Header, Imu, Quaternion, Vector3
+from acsard.core.messages.schema import Imu
 from acsard.core.messages.signature import public_name
 from acsard.core.values import NS_PER_S, Event, GyroSample, Ns
 
@@ -29,20 +28,7 @@ SIMULATOR_SENDER = "gyro of the simulator/own"  # of the built-in simulator's gy
 
 MAX_NAME_LENGTH = 64  # characters of a sender's name in a text
 
-UNKNOWN_COVARIANCE = [0.0] * 9  # zeros mean "unknown" in sensor_msgs/Imu
-
-
-class _Reading(Struct, frozen=True, kw_only=True):
-    header: Header = Header()
-    orientation: Quaternion = Quaternion()
-    orientation_covariance: Covariance3 = []
-    angular_velocity: Vector3
-    angular_velocity_covariance: Covariance3 = []
-    linear_acceleration: Vector3 = Vector3()
-    linear_acceleration_covariance: Covariance3 = []
-
-
-_readings = StrictDecoder(_Reading)
+_decoder = StrictDecoder(Imu)
 
 
 class GyroFollower:
@@ -97,13 +83,8 @@ def reading(arrival: Arrival) -> tuple[GyroSample, str]:
         raise DecodeError("not_a_put", "a DELETE is not a sample: send a PUT")
     if len(arrival.payload) > MAX_COMMAND_BYTES:
         raise DecodeError("too_big", f"{len(arrival.payload)} bytes are too many for an Imu")
-    message: Imu | _Reading
-    if detect(arrival.encoding, arrival.payload) == "cdr":
-        message = decode_cdr(Imu, arrival.payload)
-    else:
-        message = _readings.decode(arrival.encoding, arrival.payload)
-    rate = message.angular_velocity
-    variances = message.angular_velocity_covariance or UNKNOWN_COVARIANCE
+    message = _decoder.decode(arrival.encoding, arrival.payload)
+    rate, variances = message.angular_velocity, message.angular_velocity_covariance
     numbers = (rate.x, rate.y, rate.z, variances[8])
     if not all(map(math.isfinite, numbers)):
         raise DecodeError("not_finite", "the angular velocity contains NaN or infinity")

@@ -4,25 +4,17 @@ from __future__ import annotations
 
 import math
 
-from msgspec import Struct
-
 from acsard.core.incoming.commands import Arrival, caller_name
-from acsard.core.messages.encodings import DecodeError, StrictDecoder, decode_cdr, detect
+from acsard.core.messages.encodings import DecodeError, StrictDecoder
 from acsard.core.messages.keys_and_roles import SPEED_LIMIT
 from acsard.core.messages.refusals import MAX_COMMAND_BYTES
-from acsard.core.messages.schema import Header, SpeedLimit
+from acsard.core.messages.schema import SpeedLimit
 from acsard.core.values import SpeedCap
 
 NO_LIMIT_VALUE = 0.0  # of nav2_msgs/SpeedLimit, in m/s and in %
 
 
-class _Payload(Struct, frozen=True, kw_only=True):
-    header: Header = Header()
-    percentage: bool = False
-    speed_limit: float
-
-
-_decoder = StrictDecoder(_Payload)
+_decoder = StrictDecoder(SpeedLimit)
 
 
 def decode_limit(arrival: Arrival, configured: float) -> SpeedCap:
@@ -31,11 +23,7 @@ def decode_limit(arrival: Arrival, configured: float) -> SpeedCap:
         raise DecodeError("not_a_put", "a DELETE is not a speed limit: send a PUT")
     if len(arrival.payload) > MAX_COMMAND_BYTES:
         raise DecodeError("too_big", f"{len(arrival.payload)} bytes are too many for a speed limit")
-    message: SpeedLimit | _Payload
-    if detect(arrival.encoding, arrival.payload) == "cdr":
-        message = decode_cdr(SpeedLimit, arrival.payload)
-    else:
-        message = _decoder.decode(arrival.encoding, arrival.payload)
+    message = _decoder.decode(arrival.encoding, arrival.payload)
     value = message.speed_limit
     if not math.isfinite(value):
         raise DecodeError("not_finite", "the speed limit is NaN or infinity; send 0.0 to lift it")

@@ -43,7 +43,10 @@ def builder(info: inspect.StructType) -> Build:
     """Return a function that builds the struct from the values of its `leaves`."""
     kinds = [plain(field.type) for field in info.fields]
     children = [builder(kind) if isinstance(kind, inspect.StructType) else next for kind in kinds]
-    return lambda values: info.cls(*[child(values) for child in children])
+    names = [field.name for field in info.fields]
+    return lambda values: info.cls(
+        **{name: child(values) for name, child in zip(names, children, strict=True)}
+    )
 
 
 def plain(kind: inspect.Type) -> inspect.Type:

@@ -16,10 +16,8 @@ from acsard.core.messages.keys_and_roles import SERVICES
 from acsard.core.messages.schema import (
     BOTH_WAYS,
     MESSAGES,
-    Imu,
     JointState,
     Message,
-    SpeedLimit,
     TwistStamped,
 )
 from acsard.core.messages.strict_types import strict
@@ -35,8 +33,6 @@ INCOMING_ONLY = {
 REQUIRED_FIELDS: dict[type, list[str]] = {
     TwistStamped: ["twist"],
     JointState: ["name", "velocity"],
-    Imu: ["angular_velocity"],
-    SpeedLimit: ["speed_limit"],
 }
 
 Schema = dict[str, Any]

@@ -12,7 +12,7 @@ import math
 from collections.abc import Iterable
 from typing import Annotated, get_args
 
-from msgspec import Meta, Struct
+from msgspec import Meta, Struct, field
 
 from acsard.core.codes import Code, PoseCode, StateCode, WaitCode, received_text
 from acsard.core.formatting import at_terminal
@@ -40,6 +40,8 @@ Float32 = Annotated[float, Meta(extra={"cdr": "f"})]
 Covariance = Annotated[list[float], Meta(min_length=36, max_length=36)]
 
 Covariance3 = Annotated[list[float], Meta(min_length=9, max_length=9)]
+
+UNKNOWN = [0.0] * 9  # a covariance in sensor_msgs/Imu
 
 CauseNumber = Annotated[int, Meta(ge=0, lt=1 << 53)]
 """Number of a cause. It is below 2^53, so JavaScript represents it exactly."""
@@ -207,7 +209,7 @@ class JointState(Message, frozen=True):
     effort: Annotated[list[float], MAX_64_ITEMS] = []
 
 
-class Imu(Message, frozen=True):
+class Imu(Message, frozen=True, kw_only=True):
     """An inertial measurement in the frame `header.frame_id`.
 
     `angular_velocity` is in rad/s and `linear_acceleration` in m/s2. Each quantity has a 3x3
@@ -215,23 +217,23 @@ class Imu(Message, frozen=True):
     measured.
     """
 
-    header: Header
-    orientation: Quaternion
-    orientation_covariance: Covariance3
+    header: Header = Header()
+    orientation: Quaternion = Quaternion()
+    orientation_covariance: Covariance3 = field(default_factory=UNKNOWN.copy)
     angular_velocity: Vector3
-    angular_velocity_covariance: Covariance3
-    linear_acceleration: Vector3
-    linear_acceleration_covariance: Covariance3
+    angular_velocity_covariance: Covariance3 = field(default_factory=UNKNOWN.copy)
+    linear_acceleration: Vector3 = Vector3()
+    linear_acceleration_covariance: Covariance3 = field(default_factory=UNKNOWN.copy)
 
 
-class SpeedLimit(Message, frozen=True):
+class SpeedLimit(Message, frozen=True, kw_only=True):
     """A limit of the robot's speed, as in nav2_msgs/SpeedLimit.
 
     A `speed_limit` of 0.0 ends the limit.
     """
 
-    header: Header
-    percentage: bool
+    header: Header = Header()
+    percentage: bool = False
     """True if `speed_limit` is in % of the configured `limits.linear_speed`, false if in m/s."""
     speed_limit: float
 

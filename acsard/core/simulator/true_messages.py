@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from acsard.core.messages.report import from_yaw
-from acsard.core.messages.schema import Header, Imu, Pose, PoseStamped, Quaternion, Time, Vector3
+from acsard.core.messages.schema import Header, Imu, Pose, PoseStamped, Time, Vector3
 from acsard.core.simulator.simulated_robot import Observation
 from acsard.core.values import WallNs
 
@@ -21,7 +21,10 @@ def true_pose(observation: Observation, wall_ns: WallNs) -> PoseStamped:
 
 def turn_rate(observation: Observation, frame: str, wall_ns: WallNs) -> Imu:
     """Return the gyro's turn rate as an Imu message."""
-    unknown = [-1.0] + [0.0] * 8
-    rate = Vector3(z=observation.gyro)
-    header = Header(Time.from_ns(wall_ns), frame)
-    return Imu(header, Quaternion(), unknown, rate, [0.0] * 9, Vector3(), unknown)
+    unmeasured = [-1.0] + [0.0] * 8
+    return Imu(
+        header=Header(Time.from_ns(wall_ns), frame),
+        orientation_covariance=unmeasured,
+        angular_velocity=Vector3(z=observation.gyro),
+        linear_acceleration_covariance=unmeasured,
+    )
