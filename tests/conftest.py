@@ -73,8 +73,8 @@ Its unit is a loop of a million empty rounds, because computers differ: 18 ms wh
 MARKS = {"slow", "soak", "bench", "network", "systemd", "firmware", "languages", "bridge"}
 
 LOUD = (
-    "test_board.py", "test_daemon.py", "test_link_faults.py", "test_bus_faults.py",
-    "test_inputs.py", "test_access_isolation.py", "test_page_attacks.py", "test_page_lets_go.py",
+    "test_daemon.py", "test_link_faults.py", "test_bus_faults.py", "test_access_isolation.py",
+    "test_page_attacks.py", "test_page_lets_go.py",
     "test_lateness_period.py", "test_recording_disks.py",
     "test_access_strangers.py",
 )  # fmt: skip
@@ -122,7 +122,8 @@ def _unit(nodeid: str) -> str:
     directory, name = file.split("/")[-2:]
     if directory == "bench" or (directory in LIVE and name in LOUD):
         return "loud"
-    return "systemd" if directory == "systemd" else file
+    # The tests of each of these directories share what takes long to make.
+    return directory if directory in ("systemd", "firmware") else file
 
 
 class _ByUnit(LoadScopeScheduling):  # type: ignore[misc]
@@ -176,7 +177,7 @@ def _rank(item: pytest.Item) -> int:
     unit = _unit(item.nodeid)
     if unit in ("loud", "systemd"):
         return 0 if unit == "loud" else 1
-    return 2 if unit.split("/")[-2] in LIVE else 3
+    return 2 if item.nodeid.split("/")[1] in LIVE else 3
 
 
 @pytest.hookimpl(tryfirst=True)

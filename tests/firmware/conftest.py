@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import ctypes
 import shutil
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -13,13 +12,13 @@ import pytest
 from tests.firmware.board import (
     Board,
     Host,
+    Library,
+    build_core,
     build_firmware,
-    build_library,
     build_runner,
     build_sketch,
     missing,
 )
-from tests.system.harness import until
 
 FREE_SPEEDS = "50,45,55,48"
 """Free speeds in rad/s: no motor is as the firmware's constants say."""
@@ -37,38 +36,38 @@ BATTERY, CURRENT = 0, 1
 """Analog pins of the Mega."""
 
 
-@contextmanager
-def wired_board(runner: Path, wired: dict[int, Path], baud: int = 115200) -> Iterator[Board]:
-    """Run a board that has every input, a battery of 24 V and a current of 0 A.
-
-    The body runs after the board has reported that the emergency stop is not pressed.
-    """
-    with Board(runner, wired[baud], "--baud", str(baud)) as board:
-        for pin in (ESTOP, *BUMPERS):
-            board.command(f"contact {pin} closed")
-        board.command(f"analog {BATTERY} 3636")
-        board.command(f"analog {CURRENT} 2500")
-        until(lambda: " estop=ok" in board.status().from_board.last, 5.0, "it is released")
-        yield board
+def wire(board: Board) -> None:
+    """Connect every input: closed contacts, a battery of 24 V and a current of 0 A."""
+    for pin in (ESTOP, *BUMPERS):
+        board.command(f"contact {pin} closed")
+    board.command(f"analog {BATTERY} 3636")
+    board.command(f"analog {CURRENT} 2500")
+    released = " estop=ok"
+    board.waits(lambda status: released in status.from_board.last, "the stop is released", 5000.0)
 
 
 @pytest.fixture(scope="session")
-def library(tmp_path_factory: pytest.TempPathFactory) -> ctypes.CDLL:
-    """The hardware-independent part of the firmware, compiled for this machine."""
+def build(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Library]:
+    """Return a function that builds the library with these definitions, once each."""
     lacking = [tool for tool in ("make", "gcc") if shutil.which(tool) is None]
     if lacking:
         pytest.skip(f"no {' and no '.join(lacking)}")
-    return ctypes.CDLL(str(build_library(tmp_path_factory.mktemp("host"))))
+    return cache(lambda *defines: Library(tmp_path_factory.mktemp("host"), *defines))
 
 
 @pytest.fixture(scope="session")
-def coarse_library(library: ctypes.CDLL, tmp_path_factory: pytest.TempPathFactory) -> ctypes.CDLL:
+def library(build: Callable[..., Library]) -> Library:
+    """The hardware-independent part of the firmware, with its usual settings."""
+    return build()
+
+
+@pytest.fixture(scope="session")
+def coarse_library(build: Callable[..., Library]) -> Library:
     """The same library for an encoder with 96 counts per turn.
 
-    The definition is a product (`2 * 4 * 12`), as a user may write it.
+    The definition is a product, as a user may write it.
     """
-    where = tmp_path_factory.mktemp("coarse")
-    return ctypes.CDLL(str(build_library(where, "'-DCOUNTS_PER_TURN=2 * 4 * 12'")))
+    return build("-DCOUNTS_PER_TURN=2 * 4 * 12")
 
 
 @pytest.fixture(scope="session")
@@ -81,15 +80,21 @@ def firmware(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="session")
-def sketch(firmware: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The ELF file of the Arduino sketch."""
-    return build_sketch(tmp_path_factory.mktemp("sketch"))
+def core(firmware: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The library of the Arduino core."""
+    return build_core(tmp_path_factory.mktemp("core"))
 
 
 @pytest.fixture(scope="session")
-def wired_sketch(firmware: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def sketch(core: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The ELF file of the Arduino sketch."""
+    return build_sketch(core, tmp_path_factory.mktemp("sketch"))
+
+
+@pytest.fixture(scope="session")
+def wired_sketch(core: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The ELF file of the sketch with an emergency stop."""
-    return build_sketch(tmp_path_factory.mktemp("wired"), ("ESTOP = -1", f"ESTOP = {ESTOP}"))
+    return build_sketch(core, tmp_path_factory.mktemp("wired"), ("ESTOP = -1", f"ESTOP = {ESTOP}"))
 
 
 @pytest.fixture(scope="session")
@@ -119,21 +124,7 @@ def runner(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
-def board(runner: Path, firmware: Path) -> Iterator[Board]:
-    """A simulated board that has just booted. Its four motors have different free speeds."""
-    with Board(runner, firmware, "--free-speed", FREE_SPEEDS) as board:
-        yield board
-
-
-@pytest.fixture
-def host(board: Board) -> Iterator[Host]:
-    """A test program at the serial port of `board`."""
-    with Host(board.path, board) as host:
+def host(runner: Path, firmware: Path) -> Iterator[Host]:
+    """A test program at a board with the C firmware, whose motors have different free speeds."""
+    with Board(runner, firmware, "--free-speed", FREE_SPEEDS) as board, Host(board) as host:
         yield host
-
-
-@pytest.fixture
-def in_steps(board: Board) -> Iterator[None]:
-    """Let the simulated time of `board` pass only when the test program waits."""
-    with board.in_steps():
-        yield

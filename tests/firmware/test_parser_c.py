@@ -6,7 +6,6 @@ The parser is compiled for this machine.
 from __future__ import annotations
 
 import binascii
-import ctypes
 import random
 import re
 from collections.abc import Callable
@@ -21,43 +20,8 @@ from acsard.core.link.codec import Codec, FrameError
 from acsard.core.link.lines import LineReader
 from acsard.core.values import WheelSpeeds
 from tests.each import each
-from tests.firmware.board import checked, read_identity, read_reply, speeds_line
+from tests.firmware.board import Library, checked, read_identity, read_reply, speeds_line
 from tests.vectors.lines import ACCEPTED, REFUSED, SEED_LINE, ZERO
-
-
-class CommandC(ctypes.Structure):
-    _fields_ = (
-        ("hundredths", ctypes.c_int16 * 4),
-        ("checked", ctypes.c_bool),
-        ("sample", ctypes.c_bool),
-        ("sequence", ctypes.c_uint8),
-    )
-
-
-class ReaderC(ctypes.Structure):
-    _fields_ = (
-        ("text", ctypes.c_char * 128),
-        ("length", ctypes.c_uint8),
-        ("discarding", ctypes.c_bool),
-        ("too_long", ctypes.c_uint16),
-    )
-
-
-class ReadingC(ctypes.Structure):
-    _fields_ = (
-        ("milliseconds", ctypes.c_uint16),
-        ("counts", ctypes.c_uint16 * 4),
-        ("hundredths", ctypes.c_int16 * 4),
-    )
-
-
-class RecordC(ctypes.Structure):
-    _fields_ = (
-        ("lines", ctypes.c_uint32),
-        ("refused", ctypes.c_uint16),
-        ("trips", ctypes.c_uint16),
-        ("runaways", ctypes.c_uint16),
-    )
 
 
 class Command(NamedTuple):
@@ -72,87 +36,60 @@ class Command(NamedTuple):
 class Parser:
     """The firmware's C functions for lines, with Python types as arguments and results."""
 
-    def __init__(self, library: ctypes.CDLL) -> None:
-        self._parse = library.line_parse
-        self._parse.argtypes = (ctypes.c_char_p, ctypes.c_uint8, ctypes.c_void_p)
-        self._parse.restype = ctypes.c_bool
-        self._feed = library.line_feed
-        self._feed.argtypes = (ctypes.c_void_p, ctypes.c_uint8)
-        self._feed.restype = ctypes.c_uint8
-        self._reply = library.line_reply
-        self._reply.argtypes = (ctypes.c_char_p, ctypes.c_void_p, ctypes.c_void_p)
-        self._reply.restype = ctypes.c_uint8
-        self._asks = library.line_asks
-        self._asks.argtypes = (ctypes.c_char_p, ctypes.c_uint8)
-        self._asks.restype = ctypes.c_bool
-        self._identity = library.line_identity
-        self._identity.argtypes = (ctypes.c_char_p, ctypes.c_void_p, ctypes.c_char_p)
-        self._identity.restype = ctypes.c_uint8
-        self._count_up = library.count_up
-        self._count_up.argtypes = (ctypes.c_void_p,)
-        self._count_up.restype = None
-        self._reader = ReaderC()
-        self._pointer = ctypes.addressof(self._reader)
-        self._command = CommandC()
+    def __init__(self, library: Library) -> None:
+        self._library, self._c = library, library.c
+        self._command, self._reader = library.new("command"), library.new("line_reader")
 
     def parse(self, line: bytes) -> Command | None:
         """Decode a line. Return None, and check that nothing changes, if the parser refuses it."""
         command = self._command
-        before = bytes(command)
-        if not self._parse(line, len(line), ctypes.addressof(command)):
-            assert bytes(command) == before
+        before = bytes(self._library.ffi.buffer(command))
+        if not self._c.line_parse(line, len(line), command):
+            assert bytes(self._library.ffi.buffer(command)) == before
             return None
         return Command(tuple(command.hundredths), command.checked, command.sample, command.sequence)
 
     def lines(self, data: bytes) -> list[bytes]:
         """Return the whole lines in these bytes. The reader stores an incomplete line."""
-        lines = []
-        for byte in data:
-            length = self._feed(self._pointer, byte)
-            if length:
-                lines.append(ctypes.string_at(self._pointer, length))
-        return lines
+        feed, reader, buffer = self._c.line_feed, self._reader, self._library.ffi.buffer
+        return [
+            bytes(buffer(reader.text, length)) for byte in data if (length := feed(reader, byte))
+        ]
 
     def stream(self, data: bytes) -> list[Command]:
         """Return the commands in a stream, read by a parser that has just started."""
-        self._reader.length = 0
-        self._reader.discarding = False
+        self._reader = self._library.new("line_reader")
         commands = [self.parse(line) for line in self.lines(data)]
         return [command for command in commands if command is not None]
 
     def asks(self, line: bytes) -> bool:
-        return bool(self._asks(line, len(line)))
+        return bool(self._c.line_asks(line, len(line)))
 
     @property
     def too_long(self) -> int:
+        """Lines since the last `stream` began that were too long."""
         return int(self._reader.too_long)
 
     def identity(self, lines: int, refused: int, trips: int, runaways: int, reset: bytes) -> bytes:
         """Return the identity line, with CR LF."""
-        record = RecordC(lines, refused, trips, runaways)
-        out = ctypes.create_string_buffer(128)
-        length = self._identity(out, ctypes.addressof(record), reset)
-        assert length <= 128
-        return out.raw[:length]
+        record = self._library.new("record", [lines, refused, trips, runaways])
+        return self._library.text(lambda out: self._c.line_identity(out, record, reset))
 
     def counted_up(self, count: int) -> int:
         """Return the counter after one more event. It stays at its largest value."""
-        counter = ctypes.c_uint16(count)
-        self._count_up(ctypes.addressof(counter))
-        return counter.value
+        counter = self._library.ffi.new("uint16_t *", count)
+        self._c.count_up(counter)
+        return int(counter[0])
 
     def reply(self, command: Command, ms: int, counts: list[int], hundredths: list[int]) -> bytes:
         """Return the board's reply to this command, with CR LF."""
-        asked = CommandC((0,) * 4, command.checked, command.sample, command.sequence)
-        reading = ReadingC(ms, tuple(counts), tuple(hundredths))
-        out = ctypes.create_string_buffer(64)
-        length = self._reply(out, ctypes.addressof(asked), ctypes.addressof(reading))
-        assert length <= 64
-        return out.raw[:length]
+        asked = self._library.new("command", list(command))
+        reading = self._library.new("reading", [ms, counts, hundredths])
+        return self._library.text(lambda out: self._c.line_reply(out, asked, reading))
 
 
 @pytest.fixture(scope="session")
-def parser(library: ctypes.CDLL) -> Parser:
+def parser(library: Library) -> Parser:
     return Parser(library)
 
 
@@ -254,9 +191,8 @@ def test_a_stream_is_split_into_lines_as_on_the_host(parser: Parser, data: bytes
 
 
 def test_lines_of_128_bytes_or_more_are_counted_as_too_long(parser: Parser) -> None:
-    before = parser.too_long
     parser.stream(b"a" * 1000 + b"\n" + ZERO + b"\n" + b"b" * 127 + b"\n" + b"c" * 128 + b"\n")
-    assert parser.too_long == before + 2
+    assert parser.too_long == 2
 
 
 def test_only_a_lone_question_mark_requests_the_identity(parser: Parser) -> None:
@@ -268,29 +204,20 @@ def test_only_a_lone_question_mark_requests_the_identity(parser: Parser) -> None
 # checked lines
 
 
-SUFFIXES = [
-    b"#", b"*", b"#07", b"*1234", b"#07*", b"#07*123", b"#7*1234", b"#07S", b"#07s*1234",
+WRONG_SUFFIXES = [
+    b"#", b"*", b"*1234", b"#07*", b"#07*123", b"#7*1234", b"#07s*1234",
     b"#07F*1234", b"#07 *1234", b"#07*1234 ", b"#07*1234*1234", b"#07#07*1234", b"@0000",
-    b"#07S\x00*1234",
+    b"#07S\x00*1234", b"#0", b"#7", b"#007", b"#0a", b"#07F", b"#07s", b"#07 ", b"#07S0", b" #07",
+    b"#07#07", b"#07S\x00", b",,#07", b"#07@0000", b",ap00.00#07",
 ]  # fmt: skip
 
 
-@each("suffix", SUFFIXES)
-def test_a_line_with_an_incomplete_suffix_is_refused(parser: Parser, suffix: bytes) -> None:
-    assert parser.parse(ZERO + suffix) is None
-
-
-BEFORE_CHECK = [
-    b"", b"#", b"#0", b"#7", b"#007", b"#0a", b"#07F", b"#07s", b"#07 ", b"#07S0", b"#07*", b" #07",
-    b"#07#07", b"#07S\x00", b",,#07", b"@0000", b"#07@0000", b",ap00.00#07",
-]  # fmt: skip
-
-
-@each("suffix", BEFORE_CHECK)
-def test_a_line_with_a_wrong_form_is_refused_even_if_its_check_is_right(
+@each("suffix", WRONG_SUFFIXES)
+def test_a_line_with_a_wrong_suffix_is_refused_even_if_its_check_is_right(
     parser: Parser, suffix: bytes
 ) -> None:
     head = ZERO + suffix
+    assert parser.parse(head) is None
     assert parser.parse(head + b"*%04X" % binascii.crc_hqx(head, 0)) is None
 
 
@@ -330,15 +257,7 @@ def wrong_values(parser: Parser, count: int, checked_lines: bool) -> int:
     return wrong
 
 
-@pytest.mark.parametrize(
-    "count",
-    [
-        3_000,
-        pytest.param(20_000, marks=pytest.mark.slow),
-        pytest.param(1_000_000, marks=pytest.mark.soak),
-    ],
-)
-@pytest.mark.timeout(600)
+@pytest.mark.parametrize("count", [3_000, pytest.param(20_000, marks=pytest.mark.slow)])
 def test_no_single_bit_error_in_checked_lines_puts_a_wrong_speed_in_force(
     parser: Parser, count: int
 ) -> None:
@@ -384,14 +303,8 @@ def test_the_identity_line_is_readable_by_the_host_and_not_taken_for_feedback(
         Codec(WheelMap()).decode(text)
 
 
-def test_counts_configured_as_a_product_are_reported_as_a_number(
-    coarse_library: ctypes.CDLL,
-) -> None:
-    assert (
-        Parser(coarse_library)
-        .identity(0, 0, 0, 0, b"pin")
-        .startswith(b"!acsard-mcu 1 counts=96 watchdog_ms=")
-    )
+def test_counts_configured_as_a_product_are_reported_as_a_number(coarse_library: Library) -> None:
+    assert b" counts=96 " in Parser(coarse_library).identity(0, 0, 0, 0, b"pin")
 
 
 def test_a_full_counter_stays_at_its_maximum(parser: Parser) -> None:

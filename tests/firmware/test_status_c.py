@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ctypes
 from collections.abc import Callable, Sequence
 
 import pytest
@@ -10,58 +9,45 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from acsard.core.link.board_status import BoardStatus, decode_status
-from tests.firmware.board import build_library
+from tests.firmware.board import Library
 from tests.firmware.conftest import ALL_INPUTS
 
 CLOSED = 0b100000
 """Levels of the pins when nothing is pressed: contacts to ground, and no fault."""
 
-Build = Callable[..., "Inputs"]
+Build = Callable[..., Library]
 
 
 class Inputs:
-    """The firmware's functions for inputs, with a separate state for each test."""
+    """The firmware's functions for inputs after a boot of the board."""
 
-    def __init__(self, library: ctypes.CDLL) -> None:
-        u8, u16, u32 = ctypes.c_uint8, ctypes.c_uint16, ctypes.c_uint32
-        self._library, self._status = library, ctypes.create_string_buffer(256)
-        self._out = ctypes.create_string_buffer(64 + 1)
-        library.status_contacts.argtypes = [ctypes.c_void_p, u8]
-        library.status_reading.argtypes = [ctypes.c_void_p, u8, u16]
-        library.status_stopped.argtypes = [ctypes.c_void_p]
-        library.status_stopped.restype = ctypes.c_bool
-        library.status_line.argtypes = [ctypes.c_void_p, u32, ctypes.c_char_p]
-        library.status_line.restype = u8
+    def __init__(self, library: Library) -> None:
+        self._library, self._c = library, library.c
+        self._status = library.new("status")
+        self._c.status_start(self._status)
         self.milliseconds = 0
-        self.boot()
-
-    def boot(self) -> None:
-        """Reset the state, as a boot of the board does."""
-        self.milliseconds = 0
-        self._library.status_start(self._status)
 
     @property
     def stopped(self) -> bool:
         """Whether the emergency stop is pressed."""
-        pressed: bool = self._library.status_stopped(self._status)
-        return pressed
+        return bool(self._c.status_stopped(self._status))
 
     def sample(self, levels: int, readings: Sequence[int] = ()) -> BoardStatus | None:
         """Read the inputs once and advance the time by 1 ms. Return the line due then, if any."""
         self.milliseconds += 1
         for analog, value in enumerate(readings):
-            self._library.status_reading(self._status, analog, value)
-        self._library.status_contacts(self._status, levels)
+            self._c.status_reading(self._status, analog, value)
+        self._c.status_contacts(self._status, levels)
         return self.line()
 
     def line(self) -> BoardStatus | None:
         """Return the fields of the status line that is due now, or None."""
-        length = self._library.status_line(self._status, self.milliseconds, self._out)
-        if not length:
+        write = self._c.status_line
+        line = self._library.text(lambda out: write(self._status, self.milliseconds, out))
+        if not line:
             return None
-        line = self._out.raw[:length]
         assert line.endswith(b"\r\n")
-        assert length <= 52
+        assert len(line) <= 52
         return decode_status(line[:-2], True)
 
     def lines(self, levels: int, length_ms: int, readings: Sequence[int] = ()) -> list[BoardStatus]:
@@ -70,34 +56,19 @@ class Inputs:
         return [status for status in every if status is not None]
 
 
-@pytest.fixture(scope="module")
-def build(library: ctypes.CDLL, tmp_path_factory: pytest.TempPathFactory) -> Build:
-    """Return a function that builds the library with given preprocessor definitions, once each."""
-    built: dict[tuple[str, ...], ctypes.CDLL] = {}
-
-    def one(*defines: str) -> Inputs:
-        if defines not in built:
-            where = tmp_path_factory.mktemp("inputs")
-            built[defines] = ctypes.CDLL(str(build_library(where, *defines)))
-        return Inputs(built[defines])
-
-    return one
-
-
-@pytest.fixture(scope="module")
+@pytest.fixture
 def inputs(build: Build) -> Inputs:
     """The library with every input."""
-    return build(*ALL_INPUTS)
+    return Inputs(build(*ALL_INPUTS))
 
 
-def test_firmware_as_delivered_never_sends_a_status_line(library: ctypes.CDLL) -> None:
+def test_firmware_as_delivered_never_sends_a_status_line(library: Library) -> None:
     inputs = Inputs(library)
     assert inputs.lines(0xFF, 3000, (1023, 1023)) == []
     assert not inputs.stopped
 
 
 def test_contacts_are_reported_ten_times_a_second_and_values_once(inputs: Inputs) -> None:
-    inputs.boot()
     statuses = inputs.lines(CLOSED, 10_000, (512, 512))
     assert (
         98
@@ -108,23 +79,20 @@ def test_contacts_are_reported_ten_times_a_second_and_values_once(inputs: Inputs
     assert [status for status in statuses if status.estop is None] == [values] * 10
 
 
-def test_no_contact_is_reported_before_its_state_is_known(inputs: Inputs) -> None:
+@pytest.mark.parametrize("pressed", [False, True])
+def test_no_contact_is_reported_before_its_state_is_known(inputs: Inputs, pressed: bool) -> None:
     """If the board reported a press too early at boot, the robot would wait for a `clear`."""
-    inputs.boot()
-    assert inputs.lines(CLOSED, 19) == []
-    assert inputs.lines(CLOSED, 1) == [BoardStatus(estop=False, bumpers=(False,) * 4)]
-    inputs.boot()
-    assert inputs.lines(CLOSED ^ 1, 19) == []
-    assert inputs.stopped
-    assert inputs.lines(CLOSED ^ 1, 1) == [BoardStatus(estop=True, bumpers=(False,) * 4)]
+    assert inputs.lines(CLOSED ^ pressed, 19) == []
+    assert inputs.stopped == pressed
+    assert inputs.lines(CLOSED ^ pressed, 1) == [BoardStatus(estop=pressed, bumpers=(False,) * 4)]
 
 
 @given(st.lists(st.tuples(st.booleans(), st.integers(1, 25)), max_size=12))
 def test_a_contact_is_released_only_by_20_free_samples_and_pressed_by_three(
-    inputs: Inputs, runs: list[tuple[bool, int]]
+    build: Build, runs: list[tuple[bool, int]]
 ) -> None:
     """Three pressed samples press a contact if no run of 20 free samples is between them."""
-    inputs.boot()
+    inputs = Inputs(build(*ALL_INPUTS))
     inputs.lines(CLOSED, 25)
     samples: list[bool] = [False] * 25
     for pressed, length in runs:
@@ -150,7 +118,7 @@ def test_a_contact_is_released_only_by_20_free_samples_and_pressed_by_three(
 def test_bumpers_open_or_close_when_pressed(
     build: Build, defines: tuple[str, ...], free: int, pressed: int
 ) -> None:
-    inputs = build(*defines)
+    inputs = Inputs(build(*defines))
     assert inputs.lines(free, 25) == [BoardStatus(bumpers=(False, False))]
     assert inputs.lines(pressed, 5) == [BoardStatus(bumpers=(True, True))]
     assert not inputs.stopped
@@ -158,8 +126,7 @@ def test_bumpers_open_or_close_when_pressed(
 
 @pytest.mark.parametrize("length_ms", [3, 40, 500])
 def test_even_a_short_driver_fault_is_reported_within_110_ms(build: Build, length_ms: int) -> None:
-    inputs = build("-DDRIVER_INPUT=1")
-    inputs.boot()
+    inputs = Inputs(build("-DDRIVER_INPUT=1"))
     inputs.lines(CLOSED, 1200)
     begun = inputs.milliseconds
     while (
@@ -174,7 +141,6 @@ def test_even_a_short_driver_fault_is_reported_within_110_ms(build: Build, lengt
 def test_a_press_is_reported_before_the_fault_of_a_driver_that_lost_its_supply_a_little_earlier(
     inputs: Inputs,
 ) -> None:
-    inputs.boot()
     inputs.lines(CLOSED, 1200, (600, 512))
     statuses = inputs.lines(0, 50, (600, 512)) + inputs.lines(1, 100, (600, 512))
     pressed = next(i for i, status in enumerate(statuses) if status.estop)
@@ -184,7 +150,7 @@ def test_a_press_is_reported_before_the_fault_of_a_driver_that_lost_its_supply_a
 @pytest.mark.slow
 @pytest.mark.parametrize("high", [0, 1])
 def test_the_driver_fault_input_can_be_active_low_or_active_high(build: Build, high: int) -> None:
-    inputs = build("-DDRIVER_INPUT=1", f"-DDRIVER_FAULT_HIGH={high}")
+    inputs = Inputs(build("-DDRIVER_INPUT=1", f"-DDRIVER_FAULT_HIGH={high}"))
     fault = 0b100000 if high else 0
     assert inputs.lines(fault ^ 0b100000, 1000) == [BoardStatus(driver_fault=False)]
     assert inputs.lines(fault, 1000) == [BoardStatus(driver_fault=True)]
@@ -192,13 +158,13 @@ def test_the_driver_fault_input_can_be_active_low_or_active_high(build: Build, h
 
 @given(st.integers(0, 1023), st.integers(0, 1023))
 def test_volts_and_amperes_are_those_of_the_divider_and_the_sensor(
-    inputs: Inputs, battery: int, current: int
+    build: Build, battery: int, current: int
 ) -> None:
     """Compare with an independent calculation for the divider and the current sensor.
 
     The divider is 10 kilohms of 66. The sensor gives 40 mV per ampere around 2.5 V.
     """
-    inputs.boot()
+    inputs = Inputs(build(*ALL_INPUTS))
     inputs.sample(CLOSED, (battery, current))
     inputs.milliseconds = 1000
     status = inputs.line()
@@ -208,7 +174,7 @@ def test_volts_and_amperes_are_those_of_the_divider_and_the_sensor(
 
 
 def test_the_volts_are_the_mean_of_a_second(build: Build) -> None:
-    inputs = build("-DBATTERY_TOP_OHM=56000L")
+    inputs = Inputs(build("-DBATTERY_TOP_OHM=56000L"))
     for _ in range(999):
         assert inputs.sample(0, (700 + 40 * (inputs.milliseconds % 2),)) is None
     status = inputs.sample(0, (720,))
@@ -217,7 +183,7 @@ def test_the_volts_are_the_mean_of_a_second(build: Build) -> None:
 
 
 def test_values_that_do_not_fit_the_line_are_clamped(build: Build) -> None:
-    wide = build("-DBATTERY_TOP_OHM=188000L", "-DCURRENT_UV_PER_A=1000L")
+    wide = Inputs(build("-DBATTERY_TOP_OHM=188000L", "-DCURRENT_UV_PER_A=1000L"))
     status = wide.lines(0, 1000, (1023, 1023))[-1]
     assert status.volts == pytest.approx(98.9, abs=0.01)
     assert status.amps == 999.99
@@ -225,6 +191,6 @@ def test_values_that_do_not_fit_the_line_are_clamped(build: Build) -> None:
 
 
 def test_a_sensor_that_is_wired_the_other_way_round_has_a_negative_setting(build: Build) -> None:
-    inputs = build("-DCURRENT_UV_PER_A=-100000L")
+    inputs = Inputs(build("-DCURRENT_UV_PER_A=-100000L"))
     assert inputs.lines(0, 1000, (0, 0))[-1] == BoardStatus(amps=25.0)
     assert inputs.lines(0, 1000, (0, 512))[-1] == BoardStatus(amps=0.0)
