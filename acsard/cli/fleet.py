@@ -25,7 +25,8 @@ from acsard.host.errors import Exit, UnreachableError
 from acsard.host.logs import MAX_LAST_OUTPUT_S, output_in_threads
 from acsard.terminal.output import UNLIMITED_WIDTH, has_screen, plain
 from acsard.top import terminal
-from acsard.top.fleet_table import Roster, absence, table
+from acsard.top.fleet_table import table
+from acsard.top.roster import Roster, absence
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:

@@ -1,21 +1,18 @@
-"""Collects the robots that `acsard fleet` shows, and formats them as a table."""
+"""Formats the robots that `acsard fleet` shows as a table. This module is pure."""
 
 from __future__ import annotations
 
 import math
-import time
 from collections.abc import Sequence
 
-from msgspec.structs import replace
 from rich.table import Table
 from rich.text import Text
 
-from acsard.bus.robot_discovery import ALL_ROBOTS, count_text, no_robot_text
-from acsard.client.fleet import Fleet, Row
 from acsard.core.formatting import printable, rough, signed
 from acsard.core.messages.schema import RobotState
 from acsard.core.messages.state_warnings import SAME_AS_REASON, brief, charge, warnings
 from acsard.host.version import order
+from acsard.top.roster import Row, absence
 
 # On a narrower terminal, a column is left out; BATTERY also if no robot reports one.
 COLUMNS = {
@@ -100,13 +97,6 @@ def _place(state: RobotState) -> str:
     return " ".join(signed(value, decimals, 7).strip() for value, decimals in figures) + "°"
 
 
-def absence(row: Row) -> str:
-    """Return "GONE" for a robot without a daemon, "SILENT" for one that hangs, or ""."""
-    if not row.here:
-        return "GONE"
-    return "SILENT" if row.silent else ""
-
-
 def _urgency(row: Row) -> str:
     return absence(row) or ("" if row.state is None else row.state.mode)
 
@@ -116,62 +106,3 @@ def _order(row: Row) -> tuple[int, str]:
         return URGENT.index(what), row.robot_id
     warned = row.state is not None and warnings(row.state)
     return len(URGENT) + (not warned), row.robot_id
-
-
-class Roster(Fleet):
-    """The robots that `acsard fleet` shows, and the reason why robots may be missing."""
-
-    def rows(self) -> list[Row]:
-        self.send_queries(self.due())
-        return super().rows()
-
-    def gather(self) -> list[Row]:
-        """Wait for the first reports, and return one row per robot.
-
-        The wait ends when all named robots have reported; for "*" it takes 1.5 s. Without any
-        robot, or if a named one is missing, it takes 3 s, because the first answer can be late on a
-        busy computer. A robot that has not reported then is silent.
-        """
-        began, rows = time.monotonic(), self.rows()
-        while (passed := time.monotonic() - began) < 3.0:
-            present = any(row.here or row.state for row in rows)
-            if present and self.all_reported and (passed >= 1.5 or ALL_ROBOTS not in self._ids):
-                break
-            time.sleep(0.05)
-            rows = self.rows()
-        return [replace(row, silent=True) if math.isinf(row.age) else row for row in rows]
-
-    @property
-    def all_reported(self) -> bool:
-        """Whether all robots that the user named have reported."""
-        with self._lock:
-            named = [self._known.get(name) for name in self._ids if name != ALL_ROBOTS]
-        return all(
-            robot is not None and robot.here and robot.follower.is_confirmed for robot in named
-        )
-
-    @property
-    def presence_text(self) -> str:
-        """How many robots are present, or "" if the user named robots."""
-        with self._lock:
-            here = sum(robot.here for robot in self._known.values())
-        return count_text(self._robot.where.endpoint, here) if ALL_ROBOTS in self._ids else ""
-
-    @property
-    def left_out_text(self) -> str:
-        """That the table leaves out some robots, or ""."""
-        if not self.left_out:
-            return ""
-        return (
-            f"there are more than {self._most} robots, and this list shows only {self._most} "
-            "of them: to choose the robots, use --id robot1,robot2"
-        )
-
-    def hint(self) -> str:
-        """Return why no robot is there."""
-        if tuple(self._ids) == (ALL_ROBOTS,):
-            return no_robot_text(self._robot.where.endpoint)
-        return (
-            f"none of these robots is visible at {self._robot.where.endpoint}: start their daemons,"
-            " or correct --id or [fleet] robots"
-        )

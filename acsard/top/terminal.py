@@ -31,8 +31,9 @@ from acsard.host.terminal_modes import single_key_mode
 from acsard.terminal.output import MAX_TEXT_WIDTH, plain, show
 from acsard.top import drive_screen
 from acsard.top.feed import Feed
-from acsard.top.fleet_table import Roster, table
+from acsard.top.fleet_table import table
 from acsard.top.keyboard import KeyboardDrive
+from acsard.top.roster import Roster
 from acsard.top.screen import screen
 
 DRAW_PERIOD_S = 0.25  # of the small screen of `drive`

@@ -15,9 +15,7 @@ from rich.console import Console
 
 from acsard.bus.address import Address
 from acsard.bus.subscription import Subscription
-from acsard.client import fleet as fleets
 from acsard.client.connection import Connection
-from acsard.client.fleet import Row
 from acsard.client.follower import (
     FLEET_QUERY_PERIOD_S,
 )
@@ -27,9 +25,11 @@ from acsard.core.values import NS_PER_S
 from acsard.host import clock as clocks
 from acsard.host.errors import ReplyError
 from acsard.top import feed as top_feed
+from acsard.top import roster as rosters
 from acsard.top import terminal
 from acsard.top.feed import Feed
-from acsard.top.fleet_table import Roster, table
+from acsard.top.fleet_table import table
+from acsard.top.roster import Roster, Row
 from tests.unit.screens import BEFORE, INFO, STATE, drawn, sample_of
 
 
@@ -60,7 +60,7 @@ class Clock:
 @pytest.fixture
 def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
     clock = Clock()
-    monkeypatch.setattr(fleets, "clock", SimpleNamespace(steady_s=lambda: clock.now))
+    monkeypatch.setattr(rosters, "clock", SimpleNamespace(steady_s=lambda: clock.now))
     return clock
 
 

@@ -17,7 +17,6 @@ from msgspec.structs import replace
 from rich.cells import cell_len
 from rich.console import RenderableType
 
-from acsard.client.fleet import Row
 from acsard.core.messages.schema import (
     BatterySummary,
     Latency,
@@ -32,6 +31,7 @@ from acsard.daemon.latencies import NAMES
 from acsard.top import drive_screen, screen
 from acsard.top.drive_screen import Teleop
 from acsard.top.fleet_table import table
+from acsard.top.roster import Row
 from acsard.top.screen import MODE_STYLES, ScreenData, rate
 from tests.each import each
 from tests.unit.screens import INFO, SEEN, STATE, UNMEASURED, drawn, lines_of, of

@@ -1,21 +1,22 @@
 """Follows many robots: whether each daemon is present, and its newest state.
 
 A daemon is present while Zenoh shows its liveliness token. Zenoh's threads store the newest states,
-and one thread decodes them with `Fleet.rows()` and calls `due()` and `send_queries()`, of which
-only the last may wait for the bus.
+and one thread decodes them with `Roster.rows()`, which may wait for the bus.
 """
 
 from __future__ import annotations
 
 import math
+import time
 from collections.abc import Sequence
 from threading import Lock
 from typing import Any
 
 import zenoh
 from msgspec import Struct
+from msgspec.structs import replace
 
-from acsard.bus.robot_discovery import ALL_ROBOTS, robot_of
+from acsard.bus.robot_discovery import ALL_ROBOTS, count_text, no_robot_text, robot_of
 from acsard.bus.subscription import encoded
 from acsard.client.connection import Connection
 from acsard.client.follower import FLEET_QUERY_PERIOD_S, Follower
@@ -36,6 +37,13 @@ class Row(Struct, frozen=True):
     silent: bool = False  # `Follower.silent`
 
 
+def absence(row: Row) -> str:
+    """Return "GONE" for a robot without a daemon, "SILENT" for one that hangs, or ""."""
+    if not row.here:
+        return "GONE"
+    return "SILENT" if row.silent else ""
+
+
 class _TrackedRobot:
     def __init__(self) -> None:
         self.here = False
@@ -48,8 +56,8 @@ class _TrackedRobot:
         self.follower.due = self.since
 
 
-class Fleet:
-    """Follows several robots, or all robots on the bus, and returns a row for each."""
+class Roster:
+    """Follows several robots, or all robots on the bus, and says why some may be missing."""
 
     def __init__(self, robot: Connection, ids: Sequence[str], most: int = MAX_ROBOTS) -> None:
         # Raises `ZError`. "*" in `ids` is all robots. Beyond `most`, a new robot replaces an absent
@@ -73,32 +81,77 @@ class Fleet:
             raise
 
     def rows(self) -> list[Row]:
-        """Return a row for each robot."""
+        """Return a row for each robot, after queries of the states that are due."""
+        for name in self._due():
+            self._robot.sibling(name).start_query("state", self._answer)
         now = clock.steady_s()
         with self._lock:
             for robot in self._known.values():
                 self._take(robot)
             return [self._row(name, robot, now) for name, robot in self._known.items()]
 
-    def due(self) -> list[str]:
-        """Return the robots whose state must be queried, once, for `send_queries()`."""
-        now, due = clock.steady_s(), []
-        with self._lock:
-            for name, robot in self._known.items():
-                self._take(robot)
-                if robot.follower.query_is_due(now):
-                    due.append(name)
-        return due
+    def gather(self) -> list[Row]:
+        """Wait for the first reports, and return one row per robot.
 
-    def send_queries(self, due: Sequence[str]) -> None:
-        """Query the states of `due()`. This may wait for the bus. Raises `ZError`."""
-        for name in due:
-            self._robot.sibling(name).start_query("state", self._answer)
+        The wait ends when all named robots have reported; for "*" it takes 1.5 s. Without any
+        robot, or if a named one is missing, it takes 3 s, because the first answer can be late on a
+        busy computer. A robot that has not reported then is silent.
+        """
+        began, rows = time.monotonic(), self.rows()
+        while (passed := time.monotonic() - began) < 3.0:
+            present = any(row.here or row.state for row in rows)
+            if present and self.all_reported and (passed >= 1.5 or ALL_ROBOTS not in self._ids):
+                break
+            time.sleep(0.05)
+            rows = self.rows()
+        return [replace(row, silent=True) if math.isinf(row.age) else row for row in rows]
+
+    @property
+    def all_reported(self) -> bool:
+        """Whether all robots that the user named have reported."""
+        with self._lock:
+            named = [self._known.get(name) for name in self._ids if name != ALL_ROBOTS]
+        return all(
+            robot is not None and robot.here and robot.follower.is_confirmed for robot in named
+        )
+
+    @property
+    def presence_text(self) -> str:
+        """How many robots are present, or "" if the user named robots."""
+        with self._lock:
+            here = sum(robot.here for robot in self._known.values())
+        return count_text(self._robot.where.endpoint, here) if ALL_ROBOTS in self._ids else ""
+
+    @property
+    def left_out_text(self) -> str:
+        """That the table leaves out some robots, or ""."""
+        if not self.left_out:
+            return ""
+        return (
+            f"there are more than {self._most} robots, and this list shows only {self._most} "
+            "of them: to choose the robots, use --id robot1,robot2"
+        )
+
+    def hint(self) -> str:
+        """Return why no robot is there."""
+        if tuple(self._ids) == (ALL_ROBOTS,):
+            return no_robot_text(self._robot.where.endpoint)
+        return (
+            f"none of these robots is visible at {self._robot.where.endpoint}: start their daemons,"
+            " or correct --id or [fleet] robots"
+        )
 
     def end(self) -> None:
         """Unsubscribe from all robots. This may wait for the bus. Raises `ZError`."""
         for subscriber in self._declared:
             subscriber.undeclare()
+
+    def _due(self) -> list[str]:
+        now = clock.steady_s()
+        with self._lock:
+            for robot in self._known.values():
+                self._take(robot)
+            return [name for name, robot in self._known.items() if robot.follower.query_is_due(now)]
 
     def _row(self, name: str, robot: _TrackedRobot, now: float) -> Row:
         follower, state = robot.follower, robot.follower.state
