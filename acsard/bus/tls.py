@@ -165,39 +165,6 @@ def expiry_times(directory: str) -> dict[str, WallNs]:
     return {whose: _ends_ns(certificate) for whose, certificate in certificates.items()}
 
 
-def is_signed(directory: str) -> bool:
-    """Return whether an authority in `ca.pem` has signed `certificate.pem`, maybe via a chain.
-
-    Return True, too, if a file cannot be read, or if the library `cryptography` is missing.
-    """
-    try:
-        from cryptography import x509
-        from cryptography.exceptions import InvalidSignature, UnsupportedAlgorithm
-    except ImportError:
-        return True
-    try:
-        authorities, chain = (
-            x509.load_pem_x509_certificates(Path(directory, name).read_bytes())
-            for name in (CA, CERTIFICATE)
-        )
-    except (OSError, ValueError, x509.InvalidVersion):
-        return True
-
-    def signed(certificate: x509.Certificate, authority: x509.Certificate) -> bool:
-        try:
-            certificate.verify_directly_issued_by(authority)
-        except (ValueError, TypeError, InvalidSignature, UnsupportedAlgorithm):
-            return False
-        return True
-
-    for n, certificate in enumerate(chain):
-        if any(signed(certificate, authority) for authority in authorities):
-            return True
-        if not (n + 1 < len(chain) and signed(certificate, chain[n + 1])):
-            return False
-    return False
-
-
 def peer_ends_ns(endpoint: str, directory: str) -> WallNs | None:
     """Return when the certificate at an endpoint expires, without verifying it; None if unknown.
 

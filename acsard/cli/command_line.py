@@ -22,7 +22,7 @@ from types import ModuleType
 from typing import NoReturn
 
 from acsard.core.config.nearest import nearest
-from acsard.core.formatting import lines, printable
+from acsard.core.formatting import lines
 from acsard.core.values import AcsardError
 from acsard.host.errors import Exit, MendableError
 
@@ -59,11 +59,6 @@ UNLISTED = ("gateway",)  # started only by systemd and `acsard run`
 MUST_FINISH = {
     "move", "call", "set", "doctor", "mcu", "calibrate", "tls", "service",
 }  # fmt: skip
-
-MAX_ARGUMENT_LENGTH = 4096  # characters; Zenoh fails on keys above 65,535 bytes
-
-# Paths that the daemon uses, besides ACSARD_...
-PATH_VARIABLES = ("HOME", "STATE_DIRECTORY", "XDG_STATE_HOME")
 
 _EPILOG = """\
 exit codes: 0 done, 1 failure, 2 wrong usage, 65 part of the recording was left out, 66 no such
@@ -163,10 +158,6 @@ def main(argv: list[str] | None = None) -> int:
     known = {"-h", "--help", "--version"}
     if not words or (words[0].startswith("-") and words[0] not in known):
         words.insert(0, "run")
-    trouble = _unusable(words)
-    if trouble:
-        print(f"acsard: {trouble}", file=sys.stderr)
-        return Exit.USAGE
     must_finish = words[0] in MUST_FINISH
     code: int = Exit.FAILURE if must_finish else Exit.OK
     try:
@@ -206,27 +197,6 @@ def _decimal(word: str) -> str:
     from decimal import Decimal
 
     return f"{Decimal(word):f}"
-
-
-def _unusable(words: Sequence[str]) -> str:
-    # Paths and names must be UTF-8, because they appear in messages. Environment and directory
-    # matter only to the daemon, because `acsard call stop` must work everywhere.
-    texts = [(f"the argument {printable(word[:40])!r}", word) for word in words]
-    for what, text in texts:
-        if len(text) > MAX_ARGUMENT_LENGTH:
-            return f"{what}... is longer than {MAX_ARGUMENT_LENGTH} characters"
-    if words[0] == "run":
-        for name, value in os.environ.items():
-            if name in PATH_VARIABLES or name.startswith("ACSARD_"):
-                texts.append((f"the environment variable {printable(name)}", value))
-        with suppress(OSError):
-            texts.append(("the path of the current directory", os.getcwd()))
-    for what, text in texts:
-        try:
-            text.encode()
-        except UnicodeEncodeError:
-            return f"{what} is not valid UTF-8; use a name in UTF-8"
-    return ""
 
 
 def entry() -> NoReturn:

@@ -94,12 +94,6 @@ class NotPermittedError(MendableError, PermissionError):
     code = Exit.NO_PERMISSION
 
 
-class RouterFileError(MendableError, ValueError):
-    """The configuration file of a router cannot be used."""
-
-    code = Exit.BAD_CONFIG
-
-
 class CertificateError(MendableError, ValueError):
     """A TLS certificate is missing or cannot be used."""
 

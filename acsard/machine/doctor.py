@@ -23,7 +23,6 @@ from acsard.core.config.contradictions import warnings
 from acsard.core.config.live import differences
 from acsard.core.config.parsing import ConfigError, from_builtins, parse
 from acsard.core.config.settings import SIMULATOR, Config, is_tls
-from acsard.core.config.validation import write
 from acsard.core.formatting import listed
 from acsard.core.messages.diagnostics import OK
 from acsard.core.messages.schema import DiagnosticStatus, Info
@@ -206,32 +205,18 @@ def _configuration(robot: Connection, info: Info, file: Config) -> Config:
 def compared(running: Running, file: Config) -> Iterator[Finding]:
     """Yield a finding about the values of the daemon that differ from those of the file."""
     others = differences(running.config, file)
-    typed = {key: difference for key, difference in others.items() if key in OPTION_KEYS}
-    changed = {key: difference for key, difference in others.items() if key not in OPTION_KEYS}
     if not others:
         yield Finding("configuration", "ok", "the running daemon uses the file's values")
-    if typed:
-        keys = [(key.rpartition("."), write(value.its)) for key, value in typed.items()]
-        lines = "; ".join(f"[{table}] {name} = {value}" for (table, _, name), value in keys)
-        texts = [value.describe(key) for key, value in typed.items()]
-        yield Finding(
-            "configuration",
-            "ok",
-            "the running daemon has other values than the file, for example by options of `acsard "
-            f"run`: {listed(texts, MAX_KEYS, '; ')}",
-            f"to keep them after a restart, write them into the file: {lines}",
-        )
-    if changed:
-        texts = [value.describe(key) for key, value in changed.items()]
-        yield Finding(
-            "configuration",
-            "warning",
-            "the running daemon has other values than the file, by `acsard set`, by another file, "
-            "or because the file has changed since the daemon's start: "
-            f"{listed(texts, MAX_KEYS, '; ')}",
-            "restart the daemon with this file, name the daemon's file with --config, or keep a "
-            "value with `acsard set KEY VALUE --keep`",
-        )
+        return
+    texts = [difference.describe(key) for key, difference in others.items()]
+    yield Finding(
+        "configuration",
+        "ok" if others.keys() <= set(OPTION_KEYS) else "warning",
+        f"the running daemon has other values than the file: {listed(texts, MAX_KEYS, '; ')}",
+        "they come from options of `acsard run`, from `acsard set`, from another file (name it "
+        "with --config), or the file has changed since the daemon's start: restart the daemon with "
+        "this file, or write the values into it",
+    )
 
 
 def clocks(running: Running) -> Iterator[Finding]:

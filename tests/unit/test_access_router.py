@@ -11,7 +11,7 @@ import pytest
 import zenoh
 
 from acsard.bus.access import gateway_access
-from acsard.bus.fleet_router import open_router
+from acsard.cli.router import open_router
 from acsard.core.config.settings import (
     Config,
     McuConfig,
@@ -21,7 +21,7 @@ from acsard.core.config.settings import (
 )
 from acsard.core.messages.keys_and_roles import JSON_TREE, TOPICS, source_keys
 from acsard.core.values import ROLES, Role
-from acsard.host.errors import RouterFileError, UsageError
+from acsard.host.errors import ExitError, UsageError
 from acsard.machine.router_file import router_file
 from tests.each import each
 
@@ -183,7 +183,7 @@ def test_a_file_that_is_not_for_a_router_is_refused_with_its_name_the_place_and_
     file.unlink(missing_ok=True)
     if text is not None:
         file.write_text(text)
-    with pytest.raises(RouterFileError) as error:
+    with pytest.raises(ExitError) as error:
         open_router(file)
     assert phrase in str(error.value)
     assert "router.json5" in str(error.value)

@@ -40,7 +40,6 @@ PROMISED = [
     (errors.InUseError, OSError, 75),
     (errors.NotPermittedError, PermissionError, 77),
     (errors.CertificateError, ValueError, 78),
-    (errors.RouterFileError, ValueError, 78),
 ]
 """Error class, built-in base class and exit code, as section 6 of DESIGN lists them."""
 
@@ -95,16 +94,6 @@ def test_the_help_pages_have_the_approved_words(approved: Callable[[Path, str], 
 def test_an_option_may_stand_between_two_arguments(between: str, behind: str) -> None:
     known = parser(between.split()[:1])
     assert known.parse_args(between.split()) == known.parse_args(behind.split())
-
-
-@each("word", ["\udcff", "x" * 4097])
-def test_an_argument_that_no_message_could_contain_is_refused(
-    word: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert main(["get", word]) == Exit.USAGE
-    text = capsys.readouterr().err
-    assert ("not valid UTF-8" in text) == (len(word) == 1)
-    assert ("longer than 4096 characters" in text) == (len(word) > 1)
 
 
 # Each takes 1 to 20 ms of processor time to load.
