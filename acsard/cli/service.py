@@ -148,12 +148,9 @@ def main_status(args: argparse.Namespace) -> int:
         # The package has its units and rules in /usr/lib, and `dpkg --verify acsard` checks them.
         conditions = [row for row in conditions if row[0] != "missing"]
     show(table(conditions))
-    state = service.state(service.UNIT)
-    print(state or "systemd does not answer: check that this machine runs systemd")
-    if state:
-        for unit in service.ALL_UNITS[1:]:
-            print(f"\n{unit}:\n{service.state(unit)}")
-    return 0 if "ActiveState=active" in state else 1
+    states = {unit: service.state(unit) for unit in service.ALL_UNITS}
+    print("\n\n".join(f"{unit}:\n{state}" for unit, state in states.items()))
+    return 0 if "ActiveState=active" in states[service.UNIT] else 1
 
 
 def _ready(args: argparse.Namespace) -> None:

@@ -17,6 +17,7 @@ from pathlib import Path
 
 from msgspec import Struct
 
+from acsard.core.values import Seconds
 from acsard.host.atomic_file import replace
 from acsard.host.child import how_it_ended
 from acsard.host.errors import MendableError, NotPermittedError
@@ -131,15 +132,23 @@ class Run(Struct, frozen=True):
         return f"run     {' '.join(self.words)}"
 
     def do(self) -> None:
-        # Raises `MendableError` with the command's error output.
         try:
-            done = run_command(self.words, 60.0)
-            code = done.returncode
-            failed = (done.stderr.strip() or how_it_ended(code)) if code else ""
-        except (OSError, subprocess.TimeoutExpired) as error:
-            failed = str(error)
-        if failed and not self.may_fail:
-            raise MendableError(f"{' '.join(self.words)}: {failed}")
+            ran(self.words, 60.0)
+        except MendableError:
+            if not self.may_fail:
+                raise
+
+
+def ran(words: tuple[str, ...], within_s: Seconds) -> str:
+    """Run a command and return its output. Raises `MendableError` with its error output."""
+    try:
+        done = run_command(words, within_s)
+    except (OSError, subprocess.TimeoutExpired) as error:
+        raise MendableError(f"{' '.join(words)}: {error}") from None
+    if done.returncode:
+        why = done.stderr.strip() or how_it_ended(done.returncode)
+        raise MendableError(f"{' '.join(words)}: {why}")
+    return done.stdout
 
 
 class InstallCopy(Struct, frozen=True):
@@ -325,10 +334,9 @@ def uninstalling(*, purge: bool) -> list[Step]:
 
 
 def state(unit: str) -> str:
-    """Return a unit's state as lines `NAME=value`, systemctl's error text, or ""."""
+    """Return a unit's state as lines `NAME=value`, or why systemd does not say it."""
     about = "--property=ActiveState,SubState,StatusText,NRestarts"
     try:
-        done = run_command(("systemctl", "show", unit, about), 10.0)
-    except (OSError, subprocess.TimeoutExpired):
-        return ""
-    return done.stdout.strip() or done.stderr.strip()
+        return ran(("systemctl", "show", unit, about), 10.0).strip()
+    except MendableError as error:
+        return str(error)

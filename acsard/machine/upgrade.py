@@ -7,9 +7,7 @@ new version stays in use.
 
 from __future__ import annotations
 
-import os
 import re
-import subprocess
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -25,13 +23,12 @@ from acsard.core.config.settings import Config
 from acsard.core.messages.diagnostics import MAX_MISSED_FRACTION
 from acsard.core.messages.schema import RobotState
 from acsard.core.values import AcsardError, Seconds
-from acsard.host.child import how_it_ended
 from acsard.host.config_file import read
 from acsard.host.errors import MendableError
-from acsard.host.processes import run_command
+from acsard.host.processes import config_of
 from acsard.machine import service_installation as service
 from acsard.machine import versions
-from acsard.machine.service_installation import ALL_UNITS, RELOAD_COMMANDS, UNIT, Run, Write
+from acsard.machine.service_installation import ALL_UNITS, RELOAD_COMMANDS, UNIT, Run, Write, ran
 
 WATCH_S = 30.0
 WAIT_S = 60.0  # until the robot stands
@@ -63,19 +60,19 @@ def prepare(what: Path) -> str:
         )
     # The new version makes its own copy. With -B no bytecode of root gets into the environment.
     copying = (str(python), "-I", "-B", "-m", "acsard.machine.versions")
-    return _ran(copying, COPY_TIMEOUT_S).split()[-1]
+    return ran(copying, COPY_TIMEOUT_S).split()[-1]
 
 
 def _from_package(file: Path) -> str:
-    name = _ran(("dpkg-deb", "--field", str(file), "Package"), 60.0).strip()
+    name = ran(("dpkg-deb", "--field", str(file), "Package"), 60.0).strip()
     if name != "acsard":
         raise MendableError(f"{file} is the package {name}; name a package of acsard")
     # apt checks before it unpacks that this system has the Python that the package needs.
     installing = ("env", "DEBIAN_FRONTEND=noninteractive", "apt-get", "install", "--yes", "--quiet")
     # Without a terminal of its own, dpkg writes its errors to stderr.
     options = ("--allow-downgrades", "--option=Dpkg::Use-Pty=0")
-    _ran((*installing, *options, str(file.absolute())), COPY_TIMEOUT_S)
-    listed = _ran(("dpkg-query", "--listfiles", name), 60.0)
+    ran((*installing, *options, str(file.absolute())), COPY_TIMEOUT_S)
+    listed = ran(("dpkg-query", "--listfiles", name), 60.0)
     found = re.search(rf"(?m)^{versions.HOME / versions.PACKAGE}/([^/\n]+)$", listed)
     version = found[1] if found else ""
     if version not in versions.installed():
@@ -88,17 +85,6 @@ def _from_package(file: Path) -> str:
             "first, or build the package again from a commit"
         )
     return version
-
-
-def _ran(words: tuple[str, ...], within_s: Seconds) -> str:
-    try:
-        done = run_command(words, within_s)
-    except (OSError, subprocess.TimeoutExpired) as error:
-        raise MendableError(f"{' '.join(words)}: {error}") from None
-    if done.returncode:
-        why = done.stderr.strip() or how_it_ended(done.returncode)
-        raise MendableError(f"{' '.join(words)}: {why}")
-    return done.stdout
 
 
 # The service and its robot
@@ -148,20 +134,9 @@ class UnitState(Struct, frozen=True, rename="pascal"):
 
 def unit_state(unit: str) -> UnitState:
     properties = ",".join(one.encode_name for one in msgspec.structs.fields(UnitState))
-    shown = _ran(("systemctl", "show", unit, f"--property={properties}"), 10.0)
+    shown = ran(("systemctl", "show", unit, f"--property={properties}"), 10.0)
     values = dict(line.split("=", 1) for line in shown.splitlines())
     return msgspec.convert(values, UnitState, strict=False)
-
-
-def configuration_file(pid: int) -> Path:
-    """Return the path of the daemon's configuration file, which a drop-in may have chosen."""
-    try:
-        environment = Path(f"/proc/{pid}/environ").read_bytes().split(b"\0")
-    except OSError:
-        environment = []
-    variable = b"ACSARD_CONFIG="
-    named = [word.removeprefix(variable) for word in environment if word.startswith(variable)]
-    return Path(os.fsdecode(named[0])) if named else service.CONFIG_DIRECTORY / "acsard.toml"
 
 
 def _address(file: Path) -> Address:
@@ -208,11 +183,11 @@ def change(name: str, say: Say, wait_s: Seconds = WAIT_S, watch_s: Seconds = WAT
         say(f"version {name} is in use already")
         return
     daemon = unit_state(UNIT)
-    file = configuration_file(daemon.pid)
+    file = config_of(daemon.pid) or service.CONFIG_DIRECTORY / "acsard.toml"
     if file.exists():
         checking = (str(versions.HOME / name / "bin" / "acsard"), "check", "--config", str(file))
         try:
-            _ran(checking, versions.CHECK_TIMEOUT_S)
+            ran(checking, versions.CHECK_TIMEOUT_S)
         except MendableError as error:
             raise MendableError(
                 f"version {before} stays in use, because {name} refuses the configuration: {error}"

@@ -164,7 +164,7 @@ def _link(data: ScreenData, state: RobotState) -> Table:
     def counted(label: str, name: str, rates: bool = False) -> tuple[str, str, Text]:
         now, then = state.counters.get(name, 0), before.counters.get(name, 0)
         style = "yellow" if now > then and not rates else ""
-        return label, rate(now, then, seconds) if rates else "", Text(count(now), style)
+        return label, rate(now, then, seconds) if rates else "", Text(f"{now:,}", style)
 
     rows = [
         counted("lines in", "lines", True),
@@ -199,7 +199,7 @@ def _sources(state: RobotState) -> Table:
     rows = [
         (
             Text(f"{'▶ ' if _drives(source, state) else '  '}{clean(source.name)}", no_wrap=True),
-            count(source.priority),
+            f"{source.priority:,}",
             # After a `clear` no command counts, although some have been seen.
             "-" if source.age is None else rough(source.age),
             _waits(source, state),
@@ -256,7 +256,7 @@ def _rejected(state: RobotState, before: RobotState) -> Text:
         counters.sort(key=lambda item: -item[1])
         parts = [
             Text(
-                f"{clean(name.removeprefix(prefix)).replace('_', ' ')} {count(number)}",
+                f"{clean(name.removeprefix(prefix)).replace('_', ' ')} {number:,}",
                 "yellow" if number > before.counters.get(name, 0) else "",
             )
             for name, number in counters[:MAX_REASONS]
@@ -269,13 +269,6 @@ def _rejected(state: RobotState, before: RobotState) -> Text:
 def clean(text: str) -> str:
     """Return at most 256 characters of a text, with visible ones instead of control characters."""
     return "".join(c if cell_len(c) else "\ufffd" for c in printable(text[:256]))
-
-
-def count(number: int) -> str:
-    """Format an integer with thousands separators, from 10^10 on with an exponent."""
-    if abs(number) < 10**10:
-        return f"{number:,}"
-    return f"{float(max(-(10**300), min(10**300, number))):.1e}"
 
 
 def rate(later: int, earlier: int, seconds: float) -> str:

@@ -14,7 +14,7 @@ import pytest
 from acsard.bus.address import Address
 from acsard.host.errors import MendableError
 from acsard.machine import upgrade, versions
-from acsard.machine.upgrade import Look, UnitState, configuration_file, prepare, worse
+from acsard.machine.upgrade import Look, UnitState, prepare, worse
 from tests.unit.screens import STATE
 
 
@@ -193,19 +193,6 @@ def test_a_version_is_worse_without_the_link_or_with_more_missed_periods(
     assert bool(found) is bool(why)
 
 
-def test_the_configuration_file_is_the_one_that_the_daemon_s_environment_names() -> None:
-    assert configuration_file(0) == Path("/etc/acsard/acsard.toml")
-    environment = os.environ | {"ACSARD_CONFIG": "/srv/robot.toml"}
-    # The kernel may show a process without its environment until its first line.
-    words = [sys.executable, "-c", "print(flush=True); input()"]
-    pipe = subprocess.PIPE
-    with subprocess.Popen(words, env=environment, stdin=pipe, stdout=pipe) as daemon:
-        assert daemon.stdout is not None
-        daemon.stdout.readline()
-        assert configuration_file(daemon.pid) == Path("/srv/robot.toml")
-        daemon.communicate(b"\n", 10.0)
-
-
 def test_only_a_package_or_an_environment_is_a_new_version(tmp_path: Path) -> None:
     with pytest.raises(MendableError, match=r"neither a \.deb nor an environment"):
         prepare(tmp_path)
@@ -245,7 +232,7 @@ def test_a_version_that_cannot_be_started_is_left_again(
     monkeypatch.setattr(versions, "use", used.append)
     monkeypatch.setattr(versions, "go_back", lambda name, older: used.extend([older, name]))
     monkeypatch.setattr(upgrade, "unit_state", lambda unit: UnitState("inactive", 0, 0))
-    monkeypatch.setattr(upgrade, "configuration_file", lambda pid: Path("/nonexistent"))
+    monkeypatch.setattr(upgrade, "config_of", lambda pid: Path("/nonexistent"))
     monkeypatch.setattr(upgrade, "_start", start)
     with pytest.raises(MendableError, match=rf"1\.1\.0 cannot be started .*No space.*{after}"):
         upgrade.change("1.1.0", print)
