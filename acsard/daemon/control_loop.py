@@ -122,11 +122,11 @@ class ControlLoop:
         if recorder is not None:
             step = now, heard, due, line, *left, news, robot.status
             recorder.step(step, robot, self._guard)
+        publication.stopwatch.step_time(self._mono_ns() - now.mono_ns)
+        # Publish last, because the threads that send need this core and Python's interpreter lock,
+        # which are free only while this loop waits.
         if due or news is not QUIET:
             publication.publish(news, robot.applied if due else None)
-        publication.stopwatch.step_time(self._mono_ns() - now.mono_ns)
-        # Flush last, because the threads that send need this core and Python's interpreter lock,
-        # which are free only while this loop waits.
         publication.bus.flush()
         return now, news, due, line
 

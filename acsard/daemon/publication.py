@@ -94,14 +94,7 @@ class Publication:
         is_new, wanted = config is not self._config, bus.wanted_keys
         if is_new:
             self._use(config, news.answers)
-        for estimate in news.estimates:
-            for topic in report.feedback_due(estimate, wanted):
-                bus.publish_feedback(topic, estimate)
-            if estimate.asked_ns is not None:
-                self.stopwatch.round_trip(estimate.heard_ns - estimate.asked_ns)
         if applied is not None or news.events or news.status_changed:
-            if report.beat_due(now.mono_ns, wanted):
-                bus.publish_beat(self._beat())
             for key, message in report.others_due(now, news, applied, wanted, self._snapshot):
                 bus.publish(key, message)
         for answer in news.answers:
@@ -112,6 +105,14 @@ class Publication:
             self._log(event)
         if is_new:
             self.adopted(config)
+        # These may be sent here, so they are last.
+        if applied is not None and report.beat_due(now.mono_ns, wanted):
+            bus.publish_beat(self._beat())
+        for estimate in news.estimates:
+            if estimate.asked_ns is not None:
+                self.stopwatch.round_trip(estimate.heard_ns - estimate.asked_ns)
+            for topic in report.feedback_due(estimate, wanted):
+                bus.publish_feedback(topic, estimate)
 
     def answer(self, *, last: bool = False) -> None:
         """Send the answers whose latches are stored, or that wait for too long, or all (`last`)."""

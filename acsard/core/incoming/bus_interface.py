@@ -70,17 +70,16 @@ class Bus(Protocol):
         """Queue a message for the subscribers of `key`, which the next `flush` sends."""
 
     def publish_feedback(self, topic: FeedbackTopic, estimate: Estimate) -> None:
-        """Queue the message of a feedback line, which the next `flush` sends."""
+        """Send the message of a feedback line now, or queue it like `publish`.
+
+        Call this last in a step: another thread of Zenoh then needs this thread's core.
+        """
 
     def publish_beat(self, beat: Beat) -> None:
-        """Queue a beat, which the next `flush` sends."""
+        """Send a beat now, or queue it like `publish`."""
 
     def flush(self) -> None:
-        """Send the queued messages, or start to send them, without waiting.
-
-        Call this last in a step: if a message is sent here, another thread of Zenoh then needs this
-        thread's core.
-        """
+        """Start to send the queued messages, without waiting. Call this at the end of a step."""
 
     def reply(self, reply: Reply) -> None:
         """Send a reply to the query of `reply.ticket`."""

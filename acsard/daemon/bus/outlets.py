@@ -45,7 +45,7 @@ BLOCKED_AFTER_NS = NS_PER_S // 4
 # that was stopped at most 0.09 ms, because Zenoh drops the sample.
 SLOW_PUT_NS = NS_PER_S // 2000
 
-# Messages of one step that the control loop sends itself; after a stall there are more.
+# Messages of one step that the control loop sends itself, at most; after a stall there are more.
 MAX_DIRECT = 6
 
 # Heartbeat of latched ROS topics, as in rmw_zenoh.
@@ -87,7 +87,7 @@ class Outlets:
         # Native keys with a subscriber or a latched publisher.
         self.wanted: frozenset[str] = frozenset()
         self._slots: dict[str, Mailbox[_Send]] = {}
-        self._queued: list[tuple[str, _Send]] = []  # for `flush`, by topic
+        self._sent = 0  # messages that the control loop has sent itself since the last `flush`
         self.feedback_sent: Callable[[Ns], object] = _ignore
         self._slow: set[str] = set()  # topics of the control loop whose last put was slow
         self._bell = Bell()  # one for all slots, because a step fills several
@@ -114,35 +114,38 @@ class Outlets:
         self._store(topic, partial(self._send, topic, message))
 
     def publish_feedback(self, topic: FeedbackTopic, estimate: Estimate) -> None:
-        """Queue the message of a feedback line for `flush`."""
-        self._queued.append((topic.key, partial(self._send_feedback, topic, estimate)))
+        """Send the message of a feedback line now if that cannot block, else like `publish`."""
+        if self._may_send(topic.key):
+            self._send_feedback(topic, estimate)
+        else:
+            self._store(topic.key, partial(self._send_feedback, topic, estimate))
 
     def publish_beat(self, beat: Beat) -> None:
-        """Queue a beat for `flush`."""
-        self._queued.append((BEAT, partial(self._send_beat, beat)))
+        """Send a beat now if that cannot block, else like `publish`."""
+        if self._may_send(BEAT):
+            self._send_beat(beat)
+        else:
+            self._store(BEAT, partial(self._send_beat, beat))
+
+    def _may_send(self, topic: str) -> bool:
+        self._sent += 1
+        # Look for waiting messages first: the thread sets `_began_ns` before it takes one.
+        return (
+            self._direct
+            and self._sent <= MAX_DIRECT
+            and not self._slots[topic].waiting
+            and self._began_ns is None
+            and self._slow.isdisjoint(self.wanted)
+        )
 
     def flush(self) -> None:
-        """Send the beat and the messages of feedback lines, and wake the thread for the others.
+        """Wake the thread for the messages that wait, at the end of a step.
 
         Raises the exception that has ended a thread of the bus: it must end the daemon too.
         """
         if self._errors:
             raise self._errors[0]
-        queued = self._queued
-        if queued:
-            direct = self._direct and len(queued) <= MAX_DIRECT
-            for topic, send in queued:
-                # Look for waiting messages first: the thread sets `_began_ns` before it takes one.
-                if (
-                    direct
-                    and not self._slots[topic].waiting
-                    and self._began_ns is None
-                    and self._slow.isdisjoint(self.wanted)
-                ):
-                    send()
-                else:
-                    self._store(topic, send)
-            queued.clear()
+        self._sent = 0
         if self._waiting:
             self._waiting = False
             self._bell.ring()
