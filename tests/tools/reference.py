@@ -108,12 +108,14 @@ def messages() -> str:
         for kind, fields in described.items():
             if kind != name and (kind in SCHEMAS or f"## {kind}\n" in "".join(parts)):
                 continue
-            rows = (
+            rows = [
                 (f"`{field}`", _kind(value), meanings.get((kind.removesuffix("In"), field), ""))
                 for field, value in fields.get("properties", {}).items()
-            )
+            ]
             about = _flat(fields.get("description", ""))
-            body = table(("field", "type", "meaning"), rows) if fields.get("properties") else ""
+            width = 3 if any(meaning for _, _, meaning in rows) else 2
+            head = ("field", "type", "meaning")[:width]
+            body = table(head, (row[:width] for row in rows)) if rows else ""
             parts.append("\n\n".join(filter(None, (f"## {kind}", about, body))).rstrip() + "\n")
     return _page(
         "Message types",

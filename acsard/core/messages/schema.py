@@ -84,7 +84,9 @@ class Header(Message, frozen=True):
     """Time at which the data was measured, and the frame in which it is expressed."""
 
     stamp: Time = Time()
+    """Wall-clock time at which the data was measured."""
     frame_id: str = ""
+    """Name of the frame, such as `odom` or `base_link`."""
 
 
 class Vector3(Message, frozen=True):
@@ -159,9 +161,13 @@ class Odometry(Message, frozen=True):
     """
 
     header: Header
+    """Sample time, and the frame of the pose."""
     child_frame_id: str
+    """Frame of the robot, such as `base_link`."""
     pose: PoseWithCovariance
+    """Pose in `header.frame_id`, m and rad."""
     twist: TwistWithCovariance
+    """Velocity in `child_frame_id`, m/s and rad/s."""
 
     @property
     def yaw(self) -> float:
@@ -186,8 +192,11 @@ class TransformStamped(Message, frozen=True):
     """Pose of the frame `child_frame_id` in the frame `header.frame_id`."""
 
     header: Header
+    """Time of the transform, and its parent frame."""
     child_frame_id: str
+    """The child frame."""
     transform: Transform
+    """Pose of the child frame in the parent frame."""
 
 
 class TFMessage(Message, frozen=True):
@@ -204,9 +213,13 @@ class JointState(Message, frozen=True):
 
     header: Header = Header()
     name: Annotated[list[str], MAX_64_ITEMS] = []
+    """Name of each joint. `position` and `velocity` have the same order."""
     position: Annotated[list[float], MAX_64_ITEMS] = []
+    """Angle of each wheel, rad. It grows beyond 2 pi."""
     velocity: Annotated[list[float], MAX_64_ITEMS] = []
+    """Speed of each wheel, rad/s, forward is positive."""
     effort: Annotated[list[float], MAX_64_ITEMS] = []
+    """Not used."""
 
 
 class Imu(Message, frozen=True, kw_only=True):
@@ -219,10 +232,13 @@ class Imu(Message, frozen=True, kw_only=True):
 
     header: Header = Header()
     orientation: Quaternion = Quaternion()
+    """Not used by the daemon."""
     orientation_covariance: Covariance3 = field(default_factory=UNKNOWN.copy)
     angular_velocity: Vector3
+    """Turn rates, rad/s. The daemon uses z, positive to the left."""
     angular_velocity_covariance: Covariance3 = field(default_factory=UNKNOWN.copy)
     linear_acceleration: Vector3 = Vector3()
+    """Acceleration, m/s2. Not used by the daemon."""
     linear_acceleration_covariance: Covariance3 = field(default_factory=UNKNOWN.copy)
 
 
@@ -236,6 +252,7 @@ class SpeedLimit(Message, frozen=True, kw_only=True):
     percentage: bool = False
     """True if `speed_limit` is in % of the configured `limits.linear_speed`, false if in m/s."""
     speed_limit: float
+    """Highest forward speed, m/s or %; 0.0 ends the limit."""
 
 
 class Battery(Message, frozen=True):
@@ -275,13 +292,16 @@ class Battery(Message, frozen=True):
     cell_temperature: Annotated[list[Float32], MAX_64_ITEMS] = []
     """Temperature of each cell, degrees Celsius. The list is always empty."""
     location: str = ""
+    """Always empty."""
     serial_number: str = ""
+    """Always empty."""
 
 
 class BatterySummary(Message, frozen=True):
     """The main values of the battery. A value that the board does not report now is null."""
 
     volts: float | None
+    """Voltage, V."""
     percent: float | None
     """State of charge, 0 to 100."""
     amps: float | None
@@ -298,7 +318,9 @@ class SourceState(Message, frozen=True):
     """A named source of commands, as the list `commands.sources` configures it."""
 
     name: str
+    """Name of the source, the last part of the key `cmd/<source>`."""
     priority: int
+    """The source with the highest number that sends drives the robot."""
     age: float | None
     """Seconds since the last accepted command of the source.
 
@@ -332,9 +354,13 @@ class Spread(Message, frozen=True):
     """Median, 99th percentile and maximum of `count` measurements, us."""
 
     count: int
+    """Number of measurements."""
     p50: float
+    """Median, us."""
     p99: float
+    """99th percentile, us."""
     max: float
+    """Largest measurement, us."""
 
 
 class Latency(Message, frozen=True):
@@ -352,6 +378,7 @@ class Cause(Message, frozen=True):
     kind: Annotated[str, one_of(get_args(CauseKind))]
     """`clear` releases a fault and a stop, and `activate` releases `inactive`."""
     code: Annotated[str, one_of(get_args(StateCode))]
+    """Code of `text`."""
     text: str
     """The cause in words."""
     by: str
@@ -371,19 +398,29 @@ class RobotState(Message, frozen=True):
     """
 
     stamp: Time
+    """Wall-clock time of this message."""
     mode: Annotated[str, one_of(mode.value for mode in Mode)]
+    """What the robot does now."""
     reason: str
     """Why the robot moves or does not move. It is a text for people; programs use `code`."""
     x: float
+    """Position in the frame odom, m."""
     y: float
+    """Position in the frame odom, m."""
     yaw: float
+    """Heading in the frame odom, rad, left is positive, from -pi to pi."""
     linear: float | None
+    """Measured forward speed, m/s; null without feedback."""
     angular: float | None
+    """Measured turn rate, rad/s, left is positive; null without feedback."""
     wheels: list[float]
     """Measured speeds, rad/s, in the order front right, front left, rear left, rear right."""
     link: Annotated[str, one_of(get_args(State))]
+    """State of the serial link to the board."""
     source: str
+    """Name of the selected source; empty if none is selected."""
     sources: list[SourceState]
+    """All configured sources, in the order of their priority."""
     refused: str
     """The last command that was refused, and the reason; empty if no command was refused."""
     counters: dict[str, int]
@@ -509,10 +546,15 @@ class DiagnosticStatus(Message, frozen=True):
     """A diagnostic status; `level` is 0 ok, 1 warning, 2 error, 3 stale."""
 
     level: Annotated[Byte, one_of(range(4))]
+    """0 ok, 1 warning, 2 error, 3 stale."""
     name: str
+    """Part of the robot, such as `acsard: board`."""
     message: str
+    """State of the part, in words."""
     hardware_id: str
+    """Id of the robot."""
     values: list[KeyValue]
+    """Figures, and `advice` for a part that is not ok."""
 
 
 class DiagnosticArray(Message, frozen=True):
@@ -526,9 +568,13 @@ class LogEvent(Message, frozen=True):
     """An event that the daemon has logged."""
 
     stamp: Time
+    """Wall-clock time of the last occurrence."""
     name: Annotated[str, one_of(get_args(EventName))]
+    """Name of the event."""
     level: Annotated[str, one_of(get_args(Level))]
+    """Level in the log."""
     text: str
+    """The event in words."""
     by: str
     """Name of the client that caused the event; empty if no client caused it."""
     count: int
@@ -582,9 +628,11 @@ class ServiceReply(Message, frozen=True):
     """Result of a service call. `message` gives the outcome, or the mistake and its fix."""
 
     success: bool
+    """Whether the call had its effect."""
     message: str
     """A text for people; programs use `data`."""
     data: ReplyData = ReplyData()
+    """The changes that the call made."""
 
 
 class SetPose(Message, frozen=True):
@@ -621,20 +669,28 @@ class Settings(Message, frozen=True):
     """New values for settings, by the dotted keys of the settings in `acsard.toml`."""
 
     settings: Annotated[dict[str, Plain], MAX_64_ITEMS]
+    """New values by key, such as `{"limits.linear_speed": 0.8}`."""
 
 
 class Info(Message, frozen=True):
     """Identity, version and connections of the daemon."""
 
     id: str
+    """Id of the robot, `robot.id`."""
     version: str
+    """Version of the daemon."""
     pid: int
+    """Process id of the daemon."""
     port: str
+    """Path of the serial port of the board."""
     simulated: bool
+    """Whether the built-in simulator replaces the board."""
     rate: float
     """Control rate, Hz."""
     listen: list[str]
+    """Endpoints at which the daemon listens."""
     connect: list[str]
+    """Endpoints of routers to which the daemon connects."""
     services: dict[str, list[str]] = {}
     """The services of the robot, each with the fields that its payload may have."""
 
@@ -643,9 +699,12 @@ class HardwareInterface(Message, frozen=True):
     """An interface of a joint, as in a line of `ros2 control list_hardware_interfaces`."""
 
     name: str
+    """Joint and quantity: `<joint>/velocity` or `<joint>/position`."""
     kind: Annotated[str, one_of(("command", "state"))]
+    """`command`: sources write it. `state`: the daemon writes it."""
     unit: Annotated[str, one_of(("rad", "rad/s"))]
     available: bool
+    """Whether the link to the board is up."""
     claimed: bool
     """True for a command interface while a source drives."""
 
@@ -660,10 +719,15 @@ class TopicInfo(Message, frozen=True):
     """One row of the table of keys that `acsard topics` shows."""
 
     key: str
+    """The whole key, such as `acsard/acsar/odom`."""
     direction: Annotated[str, one_of(get_args(Direction))]
+    """`out` from the daemon, `in` to it; the daemon answers `query` and `service`."""
     type: str
+    """Name of the message type."""
     rate: str
+    """How often it is sent, in words."""
     note: str
+    """Contents, in words."""
 
 
 class Topics(Message, frozen=True):
