@@ -40,7 +40,7 @@ from acsard.core.motion.modes import Mode, RefusedError
 from acsard.core.motion.odometry import Odometry
 from acsard.core.motion.sanity import Sanity
 from acsard.core.motion.uncertainty import ErrorModel
-from acsard.core.motion.wheels import COARSE_ANGLE, LEAST_SPEED
+from acsard.core.motion.wheels import LEAST_SPEED
 from acsard.core.reasons import reason_of
 from acsard.core.values import (
     NS_PER_S,
@@ -458,11 +458,6 @@ class Robot:
         pressed = estop.is_pressed or estop.pressed_now is not None
         wheels.commanded = None if pressed else self._last.written
         wheels.late = self.session.lateness.step_s > WRITE_PAUSE_S
-        wheels.repeats = (
-            not self.link_setup.shows_counts
-            and line.turned is None
-            and max(line.steps) * line.dt > COARSE_ANGLE
-        )
         estimate = self._odometry.fold(line, checks, self._errors)
         if wheels.fault is not None:
             self._fault(wheels.fault, now, events)

@@ -8,6 +8,7 @@ from contextlib import nullcontext
 
 import pytest
 
+from acsard.core.config.contradictions import MOST_ASKED_HZ
 from acsard.core.config.settings import Config, ControlConfig, McuConfig, SimConfig
 from tests.scenarios.world import World
 
@@ -56,11 +57,11 @@ def test_no_line_of_a_robot_that_answers_at_uneven_times_is_dropped(counts: int)
 
 
 @pytest.mark.parametrize("configured", [True, False])
-def test_counts_are_not_counted_twice_in_lines_that_are_faster_than_the_firmware_counts(
+def test_no_count_is_counted_twice_at_the_highest_rate_of_a_board_without_counts(
     configured: bool,
 ) -> None:
     mcu = McuConfig(encoder_counts=400 * configured)
-    control = ControlConfig(rate=200.0)
+    control = ControlConfig(rate=MOST_ASKED_HZ)
     world = World(Config(control=control, mcu=mcu, sim=SimConfig(encoder_counts=400)))
     world.run(1.024)
     for linear, angular in ((0.0, 0.0), (0.2, 1.5), (0.0, 0.0)):

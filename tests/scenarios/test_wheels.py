@@ -4,16 +4,11 @@ from __future__ import annotations
 
 from contextlib import ExitStack
 from itertools import product
-from typing import Literal
 
 import pytest
 
-from acsard.core.config.settings import (
-    Config,
-    ControlConfig,
-    McuConfig,
-    SimConfig,
-)
+from acsard.core.config.contradictions import MOST_ASKED_HZ
+from acsard.core.config.settings import Config, ControlConfig, McuConfig, SimConfig
 from acsard.core.motion.wheels import (
     BLOCK_S,
     FAULT_ANGLE,
@@ -70,30 +65,18 @@ def test_repeated_impossible_lines_are_a_fault_within_thirty_milliseconds(world:
     assert world.state.x == pytest.approx(x, abs=0.2)
 
 
-@pytest.mark.parametrize(
-    ("rate", "counts", "link_check", "code"),
-    [
-        (111.0, 199, "off", "wheel_too_fast"),
-        (112.0, 199, "off", "commanded"),
-        (112.0, 201, "off", "wheel_too_fast"),
-        (112.0, 199, "on", "wheel_too_fast"),
-    ],
-)
-def test_wheels_that_are_too_fast_are_a_fault_unless_the_board_may_repeat_coarse_counts(
-    rate: float, counts: int, link_check: Literal["off", "on"], code: str
-) -> None:
-    mcu, sim = (
-        McuConfig(link_check=link_check, encoder_counts=counts),
-        SimConfig(encoder_counts=counts),
-    )
-    world = World(Config(control=ControlConfig(rate=rate), mcu=mcu, sim=sim))
+@pytest.mark.parametrize("speeds_up", [False, True])
+def test_wheels_with_few_counts_are_a_fault_only_if_they_are_too_fast(speeds_up: bool) -> None:
+    """The board is asked as often as possible without its counts."""
+    config = Config(control=ControlConfig(rate=MOST_ASKED_HZ), sim=SimConfig(encoder_counts=16))
+    world = World(config)
     world.run(0.3)
-    world.drive(0.5, seconds=2.0)
+    world.drive(0.1, seconds=2.0)
     with ExitStack() as faster:
-        for wheel in range(4):
-            faster.enter_context(world.mcu.bias(wheel, 1.35))
-        world.hold(0.5, seconds=2.0)
-    assert world.state.code == code
+        for wheel in range(4 * speeds_up):
+            faster.enter_context(world.mcu.bias(wheel, 1.6))
+        world.hold(0.1, seconds=8.0)
+    assert world.state.code == ("wheel_too_fast" if speeds_up else "commanded")
 
 
 # hands

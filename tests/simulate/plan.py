@@ -322,6 +322,8 @@ def _make_odd(dice: random.Random, config: dict[str, Any], extras: dict[str, Any
         case 4:
             mcu["reply_period"] = 0.1
             extras["board"] = [["free_running", 0.1]]
+    if _asks_too_often(config):
+        config["control"]["rate"] = 110.0
     commands = config["commands"]
     pauses = dice.random() >= 0.85
     names = [*SOURCES, "twin"]
@@ -340,21 +342,30 @@ def _make_odd(dice: random.Random, config: dict[str, Any], extras: dict[str, Any
         config["odometry"] = {"gyro": True}
 
 
+def _asks_too_often(config: dict[str, Any]) -> bool:
+    """Return whether a board would have to answer too often without its counts."""
+    rate, mcu = config["control"]["rate"], config["mcu"]
+    counts = "link_check" in mcu and "encoder_counts" in mcu
+    return rate != "auto" and rate > 111.0 and not (counts or "reply_period" in mcu)
+
+
 def _make_extreme(dice: random.Random, config: dict[str, Any]) -> None:
     """Draw rates, timeouts and pauses from their whole range, and one to six sources.
 
-    No rate is above 349 Hz, because the daemon refuses it: a plain line takes 2.9 ms at the highest
-    baud rate.
+    A board that is asked more than 111 times a second gets a link that carries its counts.
     """
     rate, period = dice.choice(
         ((10.0, 0.1), (200.0, 0.005), (300.0, 0.0034), ("auto", 0.01), (100.0, 0.01))
     )
     config["control"]["rate"] = rate
     if period < 0.01 and config["sim"].get("encoder_counts") == 96:
-        # One count in 5 ms is 13 rad/s, by which the pose drifts if no line has the counts.
+        # A board may send no counts, and one in 5 ms is 13 rad/s, by which the pose drifts.
         for table in ("sim", "mcu"):
             if "encoder_counts" in config[table]:
                 config[table]["encoder_counts"] = 400
+    if _asks_too_often(config):
+        counts = config["sim"].setdefault("encoder_counts", 3200)
+        config["mcu"] |= {"link_check": "on", "encoder_counts": counts, "baud_rate": 250000}
     names = dice.sample((*SOURCES, "twin", "sixth"), dice.randrange(1, 7))
     timeouts = [t for t in (0.05, 0.1, 0.25, 0.5, 2.0, 10.0) if t >= 2 * period]
     commands = config["commands"]

@@ -119,14 +119,8 @@ class PoseWitness:
         rates = config.get("odometry", {})
         sure = rates.get("yaw_variance_per_metre", 1.0) < 1e-4
         sure |= rates.get("yaw_variance_per_radian", 1.0) < 1e-2
-        coarse = (counts or 3200) <= 400 and not mcu_counts
-        fast = isinstance(rate, float) and rate > 100.0
-        # Nobody knows the heading as well as these rates say at ten lines a second, or from lines
-        # so frequent that their speeds are a count or none.
-        self._drifts = sure and (self._seldom or (fast and coarse))
-        # A board that is asked more often than it computes speeds repeats its counts. Neither the
-        # place nor the heading is known then, and the daemon warns if it knows the counts.
-        self._drifts |= (counts or 3200) < 200 and fast
+        # Nobody knows the heading as well as these rates say at ten lines a second.
+        self._drifts = sure and self._seldom
         self._true: deque[tuple[int, Pose]] = deque(maxlen=400)
         self._anchor: tuple[Pose, Pose] | None = None
         self._gyro = bool(rates.get("gyro"))

@@ -120,17 +120,6 @@ def test_a_robot_that_is_faster_than_its_limiter_for_a_second_is_a_fault(
     assert bench.faults[0] == "wheel_too_fast"
 
 
-@each("repeats", [False, True])
-def test_a_board_that_repeats_each_count_makes_no_wheel_too_fast(repeats: bool) -> None:
-    """It counts for 6.4 ms and is asked each 5 ms, in step with wheels of 16 counts at 1 rad/s."""
-    bench = Bench(counts=0).driven(1.0)
-    bench.wheels.repeats = repeats
-    for _ in range(20):
-        bench.run(61.36, 1.0, 0.01, each=0.005)
-        bench.run(0.0, 1.0, 0.383, each=0.005)
-    assert bench.faults[:1] == ["wheel_too_fast"] * (not repeats)
-
-
 @each(
     ("bench", "reported", "command", "seconds", "events", "text"),
     [

@@ -15,8 +15,9 @@ from acsard.core.link.checked_line import SAMPLE_REQUEST
 from acsard.core.link.codec import Codec
 from acsard.core.values import NS_PER_S, Ns
 
-# Firmware counts for at least 4 ms, and repeats its last speeds in a reply before that. If replies
-# are more frequent than this, a repeated speed looks like a new one, and counts would count twice.
+# Firmware counts for at least 4 ms, and repeats its last speeds in a reply before that. More
+# frequent replies must have its counts: if a board does not send them, a repeated speed looks like
+# a new one, and would count twice.
 LEAST_APART_NS = 9_000_000
 
 LATE_STEP_FRACTION = 0.5  # of `quiet_ns`, between two steps: the second is late

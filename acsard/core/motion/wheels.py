@@ -58,7 +58,6 @@ LEAST_SPEED = 0.05  # m/s, of a runaway that must not look like rest
 # Times the largest output of the limiter, and rad and counts rolled beyond that, both of them: a
 # sound wheel shows up to a count more than it turned.
 TOO_FAST, TOO_FAST_S, TOO_FAST_ANGLE, TOO_FAST_COUNTS = 1.2, 1.0, 0.3, 1.5
-COARSE_ANGLE = math.tau / 200  # of an encoder count that a board may report twice for seconds
 PACE_S = 1.5  # faster or slower by `AGREEMENT`, until this is a warning: 2 s with the smoothing
 ROUNDING = 0.006  # rad/s, of a reported speed
 JITTER_S = 0.004  # of the times of lines
@@ -124,7 +123,7 @@ class Wheel(Struct):
     rest_s: Seconds = 0.0
     rest_angle: Rad = 0.0
     fast_s: Seconds = 0.0  # too fast, less the time for which it was not
-    fast_angle: Rad = 0.0  # rolled beyond what the limiter allows, since it was none
+    fast_angle: Rad = 0.0  # rolled beyond what the limiter allows
     pace_s: Seconds = 0.0
     pace_angle: Rad = 0.0
     reported: RadPerS = 0.0  # in the last line
@@ -166,9 +165,6 @@ class Wheels(Struct):
     # Commanded speeds; the caller sets these three. None: the emergency stop may cut the power.
     commanded: WheelSpeeds | None = STILL
     late: bool = False  # this computer was late, so the board may have stopped the motors
-    # Lines come so soon that a board may report each count of a coarse encoder twice, while its
-    # times and the speed keep step: a sound wheel then looks up to twice as fast.
-    repeats: bool = False
     begins: bool = True  # the expected speeds begin at the measured ones
     angles: Motors = NOTHING  # of the block, rad
     turn: Rad = 0.0  # of the block by a gyro
@@ -359,7 +355,7 @@ class Wheels(Struct):
         turns, most = abs(wheel.speed), TOO_FAST * peak
         rolled = wheel.fast_angle + angle
         beyond = abs(rolled) - most * s
-        if beyond <= 0.0 or wheel.approaches or self.repeats or not peak:
+        if beyond <= 0.0 or wheel.approaches or not peak:
             wheel.fast_s = wheel.fast_angle = 0.0
         else:
             wheel.fast_angle = math.copysign(beyond, rolled)
