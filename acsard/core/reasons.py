@@ -7,7 +7,6 @@ from typing import assert_never
 from acsard.core.board_inputs import BoardInputs
 from acsard.core.codes import Reason, joined, sentence
 from acsard.core.config.settings import Config
-from acsard.core.link.link_diagnosis import PORT_RELEASED
 from acsard.core.link.link_setup import LinkSetup
 from acsard.core.link.session import McuSession
 from acsard.core.motion.arbiter import Choice
@@ -16,6 +15,8 @@ from acsard.core.motion.bumpers import missing_reason
 from acsard.core.motion.emergency_stop import MISSING_REASON
 from acsard.core.motion.lifecycle import Lifecycle
 from acsard.core.motion.modes import SHUTDOWN_REASON, Mode
+
+PORT_RELEASED = sentence("port_released")
 
 
 def reason_of(
@@ -28,7 +29,7 @@ def reason_of(
     port_trouble: str,
 ) -> Reason:
     """Return why the robot is in its mode; `port_trouble` says why the port is closed."""
-    mode, safety = life.mode, config.safety
+    mode, released, safety = life.mode, life.port_released, config.safety
     match mode:
         case Mode.DRIVING | Mode.READY:
             why, limits = chosen(choice), config.limits
@@ -42,10 +43,10 @@ def reason_of(
         case Mode.WAITING:
             if session.link == "up":
                 return MISSING_REASON if inputs.estop.missing(safety) else missing_reason(safety)
-            return session.describe_link(setup, port_trouble)
+            return PORT_RELEASED if released else session.describe_link(setup, port_trouble)
         case Mode.STOPPED | Mode.FAULT | Mode.INACTIVE:
-            if port_trouble == PORT_RELEASED.text:
-                return Reason(life.why.code, f"{life.why.text}; also {port_trouble}")
+            if released:
+                return Reason(life.why.code, f"{life.why.text}; also {PORT_RELEASED.text}")
             return life.why
         case Mode.SHUTDOWN:
             return SHUTDOWN_REASON

@@ -84,6 +84,11 @@ UNLATCHED = (Mode.DRIVING, Mode.READY)  # their reason depends only on the choic
 
 QUIET = News()
 
+PORT_LENT = (
+    "the serial port is closed; call srv/activate to open it again. The pose is unknown until "
+    "srv/reset_odometry or srv/set_pose"
+)
+
 NOTHING_CHANGED = "nothing changed: all settings already have these values"
 
 MAX_REFUSAL_LENGTH = 200  # characters in `state`: the text may quote the message of a client
@@ -107,7 +112,6 @@ class Robot:
             kind, why = f"start -> {self._life.mode}", self._life.why
             first = Event("mode", why.text, "warning", kind=kind, code=why.code)
             self._announced = (first,)
-        self.port_released = False  # another program may use the serial port
         self._choice = Choice()
         self._last = LastLine(made_of=(None, self._life.mode))
         # Motion, twist, limits and cap with which the motion does not change; its wheel speeds.
@@ -163,6 +167,7 @@ class Robot:
             unanswered=self._answered.told,
             encoders=session.count_recovery.counts(self.config.mcu.encoder_counts),
             pose_doubt=session.doubt.code,
+            port_released=life.port_released,
             sender=self._choice.sender,
             estop=self._inputs.estop.state,
             bumpers=self._inputs.bumpers.pressed,
@@ -185,6 +190,11 @@ class Robot:
     def latches(self) -> Latches:
         """The latches in force, even after an exception in a step."""
         return self._life.latches
+
+    @property
+    def port_released(self) -> bool:
+        """Whether another program may use the serial port."""
+        return self._life.port_released
 
     @property
     def applied(self) -> Twist:
@@ -516,7 +526,7 @@ class Robot:
                     self._arbiter.require_neutral(asked_ns)
                 return message, numbers
             case "activate":
-                self.port_released = False  # even if it is refused
+                life.port_released = False  # even if it is refused
                 numbers = life.activate(request.numbers, asked_ns)
                 self._arbiter.forget_clocks()
                 self._arbiter.require_neutral(asked_ns)
@@ -543,8 +553,10 @@ class Robot:
         if self._life.mode not in (Mode.STOPPED, Mode.FAULT, Mode.INACTIVE):
             self._life.deactivate(by, now)
             numbers = (self._life.latches.last,)
-        self.port_released = self._odometry.was_lent = True
-        return "the serial port is closed; call srv/activate to open it again", numbers
+        self._life.port_released = True
+        self._odometry.uncertainty.lose()
+        self._checks.gyro.rest_s = 0.0
+        return PORT_LENT, numbers
 
     @property
     def _at_rest(self) -> bool:

@@ -490,6 +490,7 @@ class Snapshot(Struct, frozen=True):
     gyro: GyroStatus = GyroStatus()
     doubt: WheelsStatus = WheelsStatus()
     pose_doubt: PoseCode | Literal[""] = ""
+    port_released: bool = False  # to another program
     estop: EstopState = ""
     bumpers: tuple[bool, ...] | None = None  # pressed, in the board's order; None if never reported
     bumper: Reason | None = None  # why one counts as pressed

@@ -55,11 +55,11 @@ PARTS: dict[str, Any] = {
     "_tally": EventThrottle,
 }
 
-# Not stored: they follow from the configuration or from the next step, no line is pending between
-# two steps, and a replay opens no port.
+# Not stored: they follow from the configuration or from the next step, and no line is pending
+# between two steps.
 DERIVED = (
     "config", "link_setup", "_kinematics", "_errors", "_steady",
-    "_until_ns", "_silence", "_is_watched", "port_released",
+    "_until_ns", "_silence", "_is_watched",
 )  # fmt: skip
 
 MAX_BYTES = 1 << 20  # usually 8 000 to 30 000, more with many senders

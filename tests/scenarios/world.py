@@ -19,7 +19,6 @@ from acsard.core.incoming.commands import Arrival
 from acsard.core.incoming.imu import SIMULATOR_SENDER
 from acsard.core.incoming.queries import Query, Reply
 from acsard.core.link.codec import Codec
-from acsard.core.link.link_diagnosis import PORT_RELEASED
 from acsard.core.link.serial_output import Offered, SerialOutput
 from acsard.core.messages.encodings import encode
 from acsard.core.messages.frames import FeedbackTopic
@@ -103,10 +102,9 @@ class VirtualPort:
 
     def release(self, released: bool) -> None:
         if released and self.mcu is not None:
-            self._lent, self.trouble = self.mcu, PORT_RELEASED.text
+            self._lent = self.mcu
             self.unplug()
         elif not released and self._lent is not None:
-            self.trouble = ""
             self.plug(self._lent)
             self._lent = None
         self.released = released

@@ -24,7 +24,6 @@ from acsard.core.config.settings import (
     RobotConfig,
     SafetyConfig,
 )
-from acsard.core.link.link_diagnosis import PORT_RELEASED
 from acsard.core.messages.diagnostics import SHOW_REFUSAL_S, diagnostics
 from acsard.core.messages.schema import DiagnosticStatus
 from acsard.core.motion.bumpers import SILENT_REASON
@@ -64,7 +63,7 @@ SITUATIONS: dict[str, tuple[Config, dict[str, Any]]] = {
         CONFIG, {"mode": "waiting", "link": "down", "code": "port_trouble"},
     ),
     "a port that was released": (
-        CONFIG, {"mode": "stopped", "link": "down", "reason": f"also {PORT_RELEASED.text}"},
+        CONFIG, {"mode": "stopped", "link": "down", "port_released": True},
     ),
     "a late computer": (CONFIG, {"link": "stale", "code": "host_late"}),
     "the simulator": (Config(), {}),

@@ -2,17 +2,12 @@
 
 from __future__ import annotations
 
-import math
-
 import pytest
+from msgspec.structs import replace
 
 from acsard.core.config.settings import Config, McuConfig, OdometryConfig
-from acsard.core.values import (
-    REST,
-    Request,
-    Verb,
-    WheelSpeeds,
-)
+from acsard.core.motion.uncertainty import UNKNOWN_POSE
+from acsard.core.values import REST, Request, Verb, WheelSpeeds
 from tests.each import each
 from tests.unit.rig import GO, ZERO_LINE, Rig
 
@@ -67,23 +62,30 @@ def test_the_port_is_released_at_rest_and_a_robot_that_was_off_stays_off(
     assert (rig.robot.port_released, rig.mode) == (False, mode)
 
 
-def test_a_pose_is_as_uncertain_as_the_robot_may_have_been_driven_while_the_port_was_lent() -> None:
+def test_the_pose_is_unknown_after_another_program_had_the_port_until_it_is_set() -> None:
     rig = Rig(REAL).linked()
     rig.run(100)
-    before = rig.out.estimates[-1].covariance
+    rig.unplug().step(ms=10_000)
+    assert rig.replug().linked().out.estimates[-1].covariance != UNKNOWN_POSE
     (answer,) = rig.asked(Request("deactivate", 1, release_port=True)).answers
-    rig.unplug().step(ms=10_000)
+    assert "the pose is unknown until" in answer.message.lower()
+    rig.unplug().step(ms=100)
     rig.replug().asked(Request("activate", 2, numbers=answer.numbers))
-    after = rig.linked().out.estimates[-1].covariance
-    limits = REAL.limits
-    for was, now, speed in [
-        (before.xx, after.xx, limits.linear_speed),
-        (before.yy, after.yy, limits.linear_speed),
-        (before.yawyaw, after.yawyaw, limits.angular_speed),
-    ]:
-        assert math.sqrt(now - was) == pytest.approx(10.0 * speed, rel=0.02)
-    rig.unplug().step(ms=10_000)
-    assert rig.replug().linked().out.estimates[-1].covariance == after, "nobody else had it"
+    assert rig.linked().out.estimates[-1].covariance == UNKNOWN_POSE
+    rig.asked(Request("reset_odometry", 3))
+    rig.run(5)
+    assert rig.out.estimates[-1].covariance.xx < 1e-4
+
+
+def test_the_gyro_of_a_robot_that_another_program_may_turn_does_not_rest() -> None:
+    config = replace(REAL, odometry=OdometryConfig(gyro=True))
+    rig = Rig(config).linked()
+    rig.run(100)
+    rig.asked(Request("deactivate", 1, release_port=True))
+    rig.unplug()
+    for _ in range(100):
+        rig.step(gyro=0.1)
+    assert rig.robot.snapshot(rig.now_ns).gyro.bias is None
 
 
 @each(("speed", "released"), [(b"01.10", False), (b"00.90", True)])

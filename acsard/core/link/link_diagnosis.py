@@ -67,7 +67,6 @@ def is_text(line: bytes) -> bool:
 
 
 PORT_BLOCKED = sentence("port_blocked")
-PORT_RELEASED = sentence("port_released")  # its text is the trouble of a port that was lent
 
 WINDOW_LINES = 1000  # sent lines whose answers are counted: 10 s at 100 Hz
 

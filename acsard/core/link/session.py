@@ -212,8 +212,6 @@ class McuSession(Struct):
 
     def describe_link(self, setup: LinkSetup, port_trouble: str = "") -> Reason:
         """Return a sentence about the link; `port_trouble` says why the port is closed."""
-        if port_trouble == link_diagnosis.PORT_RELEASED.text:
-            return link_diagnosis.PORT_RELEASED
         if self.link == "down" and port_trouble:
             return sentence("port_trouble", trouble=port_trouble)
         if self.blocked:

@@ -16,11 +16,7 @@ from acsard.core.codes import GUARD_CODES, HOST_CODES, sentence
 from acsard.core.config.settings import Config
 from acsard.core.config.wire_time import wire_use
 from acsard.core.formatting import many
-from acsard.core.link.link_diagnosis import (
-    BUSY_ADVICE,
-    MAX_UNANSWERED_FRACTION,
-    PORT_RELEASED,
-)
+from acsard.core.link.link_diagnosis import BUSY_ADVICE, MAX_UNANSWERED_FRACTION
 from acsard.core.messages.certificate_expiry import CERTIFICATE_LEVELS
 from acsard.core.messages.schema import DiagnosticArray, DiagnosticStatus, Header, KeyValue, Time
 from acsard.core.motion import battery
@@ -198,7 +194,7 @@ def _link(config: Config, snapshot: Snapshot) -> Iterator[Finding]:
     by_host = simulated or status.code in HOST_CODES
     advice = BUSY_ADVICE if by_host else _check(config)
     if status.link == "down" and not simulated:
-        advice = ACTIVATE if PORT_RELEASED.text in status.reason else PORT_ADVICE
+        advice = ACTIVATE if snapshot.port_released else PORT_ADVICE
     if status.link == "up":
         yield OK, "up", ""
     else:

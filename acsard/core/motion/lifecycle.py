@@ -49,6 +49,7 @@ class Lifecycle(Struct):
     unshown: bool = True  # call `begin`
     begun: bool = False  # a step of this run has published its state
     stop_asked_ns: Ns = NEVER_NS  # latest arrival of a client's stop
+    port_released: bool = False  # another program may use the serial port
 
     def __post_init__(self) -> None:
         self._derive()

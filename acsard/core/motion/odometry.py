@@ -50,7 +50,6 @@ class Odometry(Struct):
     # The pose was set after the last line: a part of the motion since that line came before it.
     was_set: bool = False
     state: tuple[bool, bool, bool] = (True, False, False)  # at rest, slips, by a gyro
-    was_lent: bool = False  # another program had the port after the last line, and may have driven
     gaps: int = 0  # with unknown motion
     unknown: Seconds = 0.0  # in these
     filled: Seconds = 0.0
@@ -129,11 +128,7 @@ class Odometry(Struct):
             if self.was_set:
                 self.was_set = False
                 uncertainty.doubt((distance / 2) ** 2, (angle / 2) ** 2, 0.0, heading)
-            if gap and self.was_lent:
-                self.was_lent = False
-                along, yaw = model.driven_by_others(gap.unknown)
-                uncertainty.doubt(along, yaw, along, heading)
-            elif gap and not (rested and line.driven <= 0.0):
+            if gap and not (rested and line.driven <= 0.0):
                 self._doubt_gap(gap, before, turn is not None, heading, model)
             if line.doubt is not None:
                 distance, angle = model.kinematics.moved(line.doubt)

@@ -152,10 +152,6 @@ class ErrorModel:
         yaw = min(acceleration.angular * short / 4, speed.angular) * short
         return along**2 + self.of_speed[0] * quantum, yaw**2 + self.of_speed[1] * quantum
 
-    def driven_by_others(self, seconds: Seconds) -> tuple[float, float]:
-        """Return the variances of the position, m2, and the turn, rad2, if anyone drove so long."""
-        return (self.speed.linear * seconds) ** 2, (self.speed.angular * seconds) ** 2
-
 
 class Stretch(Struct):
     """The motion since the last update."""
@@ -217,6 +213,10 @@ class Uncertainty(Struct):
     def initial(cls, model: ErrorModel) -> Uncertainty:
         columns = [ORIGIN] * CAUSES
         return cls(model.start, model.start, Bend(model.start, columns), columns)
+
+    def lose(self) -> None:
+        """Make the pose unknown until it is set."""
+        self.p = self.covariance = UNKNOWN_POSE
 
     def update(self, model: ErrorModel, yaw: Rad, *, slips: bool, by_gyro: bool) -> None:
         """End the stretch, at the end of which the robot has the heading `yaw`."""

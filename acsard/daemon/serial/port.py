@@ -15,7 +15,6 @@ from collections.abc import Callable
 
 import serial
 
-from acsard.core.link.link_diagnosis import PORT_RELEASED
 from acsard.core.link.serial_output import Offered, Port, SerialOutput
 from acsard.core.values import Event, Instant, Ns, Received
 from acsard.daemon.serial.device import close, draining, open_raw, refusal, unsent
@@ -116,7 +115,7 @@ class SerialPort(Port):
             return
         self._ours.clear()
         self._leave(None)
-        self.trouble = PORT_RELEASED.text
+        self.trouble = ""
 
     # Opening and reopening.
 
@@ -174,7 +173,7 @@ class SerialPort(Port):
         if not self._ours.is_set():
             close(device)
             device.close()
-            raise OSError(errno.EBUSY, PORT_RELEASED.text)
+            raise OSError(errno.EBUSY, "the port was released meanwhile")
         self._lost.clear()
         self._device, self._fd = device, device.fileno()
         self._output, self.sent_ns = SerialOutput(baud_rate, self._stop, self._period_ns), 0
