@@ -5,21 +5,15 @@ OpenSSL checks this in the tests.
 
 from __future__ import annotations
 
-import errno
 import ssl
 from contextlib import suppress
-from datetime import UTC, datetime, timedelta
 from pathlib import Path
-from typing import Any
 
 import pytest
 from cryptography import x509
-from cryptography.hazmat.primitives import hashes
 from cryptography.hazmat.primitives.asymmetric import ec
 
-from acsard.host import atomic_file
 from acsard.host.errors import MendableError
-from acsard.machine import authority as making
 from acsard.machine.authority import Authority
 from tests.each import each
 
@@ -74,12 +68,6 @@ def test_a_certificate_is_valid_for_a_permitted_name_only(
     assert connects(where, tmp_path / name, name, tmp_path / "client") == (name in PERMITTED)
 
 
-def test_the_constraints_are_critical(authority: tuple[Authority, Path]) -> None:
-    certificate = x509.load_pem_x509_certificate((authority[1] / "ca.pem").read_bytes())
-    extension = certificate.extensions.get_extension_for_class(x509.NameConstraints)
-    assert extension.critical
-
-
 def test_an_authority_of_another_program_without_constraints_may_sign_for_any_name(
     authority: tuple[Authority, Path], tmp_path: Path
 ) -> None:
@@ -89,63 +77,9 @@ def test_an_authority_of_another_program_without_constraints_may_sign_for_any_na
     assert Authority(certificate, key).permits("bank.example")
 
 
-def test_a_disk_that_refuses_a_file_leaves_the_earlier_key_and_certificate(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    mine = Authority.make(tmp_path / "ca", "test", 1, OWN)
-    mine.issue(tmp_path / "robot", "robot", ["robot1"], 1)
-    before = {path: path.read_bytes() for path in (tmp_path / "robot").iterdir()}
-    written, write = [], atomic_file.replace
-
-    def full(path: Path, *words: object, **options: Any) -> None:
-        written.append(path)
-        if len(written) == 3:
-            raise OSError(errno.ENOSPC, "No space left on device")
-        write(path, *words, **options)  # type: ignore[arg-type]
-
-    monkeypatch.setattr(making, "replace", full)
-    with pytest.raises(MendableError, match=r"cannot write .*: No space left on device"):
-        mine.issue(tmp_path / "robot", "robot", ["robot1"], 1)
-    assert {path: path.read_bytes() for path in (tmp_path / "robot").iterdir()} == before
-
-
-@pytest.mark.parametrize("blocked", ["certificate.pem", "key.pem"])
-def test_a_file_that_cannot_be_replaced_leaves_the_pair_that_belongs_together(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, blocked: str
-) -> None:
-    mine, own = Authority.make(tmp_path / "ca", "test", 1, OWN), tmp_path / "robot"
-    mine.issue(own, "robot", ["robot1"], 1)
-    before = {path: path.read_bytes() for path in own.iterdir()}
-    modes = {path: path.stat().st_mode for path in own.iterdir()}
-    rename = Path.replace
-
-    def immutable(path: Path, target: Path) -> Path:
-        if target.name == blocked and path.name.endswith(".new"):
-            raise OSError(errno.EROFS, "Read-only file system")
-        return rename(path, target)
-
-    monkeypatch.setattr(Path, "replace", immutable)
-    with pytest.raises(MendableError, match=r"cannot write .*: Read-only file system"):
-        mine.issue(own, "robot", ["robot1"], 1)
-    assert {path: path.read_bytes() for path in own.iterdir()} == before
-    assert {path: path.stat().st_mode for path in own.iterdir()} == modes
-
-
 def test_a_directory_in_the_place_of_a_file_leaves_no_half_of_a_pair(tmp_path: Path) -> None:
     mine, own = Authority.make(tmp_path / "ca", "test", 1, OWN), tmp_path / "robot"
     (own / "key.pem").mkdir(parents=True)
     with pytest.raises(MendableError, match=r"cannot write .*key.pem"):
         mine.issue(own, "robot", ["robot1"], 1)
     assert [path.name for path in own.iterdir()] == ["key.pem"]
-
-
-def test_an_authority_without_an_identifier_of_its_key_can_sign(tmp_path: Path) -> None:
-    key, now = ec.generate_private_key(ec.SECP256R1()), datetime.now(UTC)
-    name = x509.Name([x509.NameAttribute(x509.NameOID.COMMON_NAME, "other")])
-    certificate = (
-        x509.CertificateBuilder(name, name, key.public_key(), 1, now, now + timedelta(days=1))
-        .add_extension(x509.BasicConstraints(ca=True, path_length=0), critical=True)
-        .sign(key, hashes.SHA256())
-    )
-    Authority(certificate, key).issue(tmp_path, "robot", ["robot1"], 1)
-    assert (tmp_path / "certificate.pem").is_file()

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import threading
 from collections.abc import Callable
 from pathlib import Path
 
@@ -102,38 +101,4 @@ async def test_new_files_and_a_new_router_are_noticed_and_missing_ones_change_no
     (tmp_path / "certificate.pem").unlink()
     await asyncio.sleep(0.1)
     assert known.keys() == {"", "the authority", f"the router {ROUTER}"}
-    task.cancel()
-
-
-async def test_a_disk_that_hangs_takes_one_thread(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    begun, answers = list[int](), threading.Event()
-
-    def hang(directory: str) -> dict[str, int]:
-        begun.append(1)
-        answers.wait()
-        return {"": 8}
-
-    monkeypatch.setattr(module, "EXPIRY_CHECK_PERIOD_S", 0.0)
-    monkeypatch.setattr(module, "expiry_times", hang)
-    known = {"": 7}
-    task = asyncio.create_task(watch_certificates(BusConfig(tls=str(tmp_path)), known))
-    await asyncio.sleep(0.1)
-    assert len(begun) == 1
-    answers.set()
-    await until(lambda: known[""] == 8)
-    task.cancel()
-
-
-async def test_the_expiry_of_the_robots_own_certificate_is_left_to_its_gateway(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    Authority.make(tmp_path, "test", 10).issue(tmp_path, "robot", [], 10)
-    monkeypatch.setattr(module, "EXPIRY_CHECK_PERIOD_S", 0.0)
-    known = {"": 7}
-    bus = BusConfig(listen=("tcp/127.0.0.1:1", "tls/0.0.0.0:7449"), tls=str(tmp_path))
-    task = asyncio.create_task(watch_certificates(bus, known))
-    await until(lambda: "the authority" in known)
-    assert known[""] == 7
     task.cancel()

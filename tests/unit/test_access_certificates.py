@@ -317,12 +317,3 @@ def test_an_encrypted_authority_s_password_is_asked_for(own: Path) -> None:
     assert process.wait(30.0) == 0
     os.close(leader)
     assert certificate(own).serial_number != before
-
-
-@pytest.mark.slow
-def test_an_encrypted_authority_without_a_terminal_is_refused_with_the_reason(own: Path) -> None:
-    encrypt(own, b"secret")
-    words = [sys.executable, "-m", "acsard", "tls", "renew", "--directory", str(own)]
-    done = subprocess.run(words, input="secret\n", capture_output=True, text=True, timeout=30.0)
-    assert (done.returncode, "encrypted" in done.stderr) == (Exit.USAGE, True)
-    assert "Traceback" not in done.stderr

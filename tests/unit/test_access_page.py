@@ -13,14 +13,11 @@ from acsard.web.callers import (
     RequestRefusedError,
     by_listed_page,
     cookie_name,
-    host_name,
-    is_loopback,
     network_of,
     place,
     require_own_origin,
     tokens_in,
     tokens_offered,
-    unmapped,
 )
 from tests.each import each
 
@@ -128,25 +125,6 @@ def test_a_role_has_the_permissions_of_the_roles_below_it() -> None:
     ) as error:
         viewer.require("operator", "clear")
     assert error.value.reason == "role"
-
-
-def test_host_names_are_split_from_ports_and_loopback_addresses_are_recognized() -> None:
-    assert [host_name(h) for h in ("A:1", "[::1]:2", "1.2.3.4", "[fe80::1")] == [
-        "a", "::1", "1.2.3.4", "fe80::1",
-    ]  # fmt: skip
-    assert [is_loopback(a) for a in ("127.1.2.3", "::1", "localhost", "10.0.0.1", "")] == [
-        True, True, False, False, False,
-    ]  # fmt: skip
-
-
-def test_a_mapped_ipv4_address_is_shown_as_ipv4() -> None:
-    addresses = ("::ffff:192.168.1.7", "192.168.1.7", "::1", "fe80::ffff:1", "")
-    assert [unmapped(address) for address in addresses] == [
-        "192.168.1.7",
-        "192.168.1.7",
-        "::1",
-        *addresses[3:],
-    ]
 
 
 def test_a_page_reads_its_own_cookie_first_and_no_other_robot_s_cookie() -> None:

@@ -147,15 +147,6 @@ def test_a_name_may_occur_only_once(
         router_file(TEMPLATE, robots, people)
 
 
-def test_a_robot_may_have_a_name_that_the_template_uses_otherwise() -> None:
-    robots = ["viewers", "hear", "learn", "a", "see-a", "own-a", "robot-a"]
-    access = router_config(robots)
-    for kind in ("rules", "subjects"):
-        ids = [entry["id"] for entry in access[kind]]
-        assert len(set(ids)) == len(ids)
-    assert len(access["storages"]) == 3 * len(robots)
-
-
 # files that the router does not open
 
 

@@ -108,24 +108,6 @@ def test_an_absent_host_is_distinguished_from_a_port_without_a_program(
     assert untold not in message
 
 
-@pytest.mark.parametrize("options", ["?prio=0-5", "#iface=eth0", "?prio=0-5#iface=eth0"])
-def test_the_options_of_an_endpoint_are_not_part_of_its_port(
-    options: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    asked = []
-
-    def connection(address: tuple[str, int], *_: Any) -> None:
-        asked.append(address)
-        raise TimeoutError
-
-    monkeypatch.setattr(socket, "create_connection", connection)
-    assert trouble(f"tls/robot.local:7449{options}", "") == (
-        "robot.local does not answer on port 7449: is robot.local switched on, "
-        "and does a firewall drop connections?"
-    )
-    assert asked == [("robot.local", 7449)]
-
-
 @pytest.mark.parametrize(
     ("code", "reason", "phrase"),
     [
@@ -143,12 +125,6 @@ def test_a_rejected_server_certificate_has_the_reason_of_openssl(
     assert phrase in message
     assert f"({reason})" in message
     assert ("did not sign" in message) is (code == 20)
-
-
-def test_a_rejected_client_certificate_has_the_alert_of_the_server() -> None:
-    message = tls._client_certificate_error("SSLV3_ALERT_CERTIFICATE_REVOKED", "robot", "dir")
-    assert "robot does not accept dir/certificate.pem (SSLV3_ALERT_CERTIFICATE_REVOKED)" in message
-    assert "did not sign" in tls._client_certificate_error("TLSV1_ALERT_UNKNOWN_CA", "robot", "dir")
 
 
 @pytest.mark.slow

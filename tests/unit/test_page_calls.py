@@ -21,14 +21,12 @@ from acsard.core.config.live import LIVE
 from acsard.core.config.parsing import effective
 from acsard.core.config.settings import Config, WebConfig
 from acsard.core.messages.schema import ServiceReply
-from acsard.core.values import NS_PER_S, Role
-from acsard.host import clock
+from acsard.core.values import Role
 from acsard.host.errors import NoAnswerError
 from acsard.web.access import IDENTITY_KEY
 from acsard.web.app import Page, settings_in
 from acsard.web.callers import AdmittedClient, RequestRefusedError
 from acsard.web.calls import Calls, unanswered
-from acsard.web.camera import Camera
 from acsard.web.connections import Connections
 from acsard.web.followed_robot import About, FollowedRobot
 from acsard.web.metrics import Counts
@@ -126,23 +124,6 @@ def page_of(directory: Path, client: Connection | None = None) -> Page:
     return Page(
         Parts(followed(client), counts), tokens, frozenset(), Connections(counts), WebConfig()
     )
-
-
-async def test_the_age_of_a_picture_counts_a_suspend(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """The age must include the suspend, in which the monotonic clock stands still."""
-    page = page_of(tmp_path)
-    page._camera = Camera("http://127.0.0.1:1/")
-    page._camera._take(b"picture")
-    slept_ns = clock.asleep_ns() + 3600 * NS_PER_S
-    monkeypatch.setattr(clock, "asleep_ns", lambda: slept_ns)
-    request = make_mocked_request("GET", "/api/camera")
-    request[IDENTITY_KEY] = MAINTAINER
-    headers = (await page.picture(request)).headers
-    page._camera.close()
-    assert int(headers["Age-Ms"]) >= 3_600_000
-    assert int(headers["Waited-Ms"]) < 60_000
 
 
 class Daemon:

@@ -9,9 +9,7 @@ from unittest.mock import Mock
 import pytest
 from aiohttp import StreamReader
 
-from acsard.core.values import NS_PER_S
-from acsard.host import clock
-from acsard.web.camera import STREAM_ERRORS, Camera, pictures
+from acsard.web.camera import STREAM_ERRORS, pictures
 from tests.each import each
 
 PICTURES = [bytes([0xFF, 0xD8, n]) * (n + 1) + b"\r\n--\r\n\r\n" for n in range(5)]
@@ -88,16 +86,3 @@ async def test_an_answer_that_is_not_a_stream_is_an_error() -> None:
     reader = StreamReader(Mock(_reading_paused=False), 2**16)
     with pytest.raises(ValueError, match="'text/html', not an MJPEG stream"):
         await anext(pictures("text/html", reader))
-
-
-async def test_a_camera_that_no_client_asked_for_in_a_suspend_is_idle(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    camera = Camera("http://127.0.0.1:1/")
-    camera._take(b"picture")
-    await camera.after(0)
-    camera.close()
-    assert not camera._idle()
-    slept_ns = clock.asleep_ns() + 3600 * NS_PER_S
-    monkeypatch.setattr(clock, "asleep_ns", lambda: slept_ns)
-    assert camera._idle()

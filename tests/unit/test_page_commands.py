@@ -163,17 +163,6 @@ def test_a_speed_that_waited_during_a_suspend_is_dropped(
     assert bus.counts.all()["commands_dropped"] == 1
 
 
-def test_no_zero_is_sent_for_a_drive_that_ended_before_a_suspend(
-    bus: Bus, relay: Relay, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    bus.outbox.take(relay, AHEAD)
-    bus.outbox.flush(PATIENCE_S)
-    suspend(monkeypatch)
-    bus.outbox.release(relay, 0.25)
-    bus.outbox.flush(PATIENCE_S)
-    assert bus.sent == [AHEAD.twist]
-
-
 def test_the_zero_of_a_sender_that_leaves_while_the_bus_is_blocked_is_sent(
     bus: Bus, relay: Relay
 ) -> None:

@@ -2,23 +2,18 @@
 
 from __future__ import annotations
 
-import asyncio
 import base64
 import gzip
 import hashlib
 import re
-import ssl
-from contextlib import suppress
 from pathlib import Path
 
 import pytest
 from aiohttp.test_utils import make_mocked_request
 
-from acsard.machine.authority import Authority
 from acsard.web.answers import (
     INLINED,
     PAGE_DIRECTORY,
-    cut,
     file_answer,
     page_files,
 )
@@ -90,34 +85,3 @@ def test_a_page_that_the_browser_has_already_keeps_its_policy() -> None:
     policies = [response.headers["Content-Security-Policy"] for response in (first, again)]
     assert policies[0] == policies[1]
     assert policies[0].endswith(page.policy)
-
-
-@pytest.mark.parametrize("secure", [True, False])
-@pytest.mark.parametrize("closed", [0, 1, 2])
-async def test_a_connection_can_be_cut_however_often_it_was_closed(
-    tmp_path: Path, secure: bool, closed: int
-) -> None:
-    ours = trusted = None
-    if secure:
-        Authority.make(tmp_path, "test", 1, ["127.0.0.1"]).issue(
-            tmp_path / "robot", "robot", ["127.0.0.1"], 1
-        )
-        ours = ssl.create_default_context(ssl.Purpose.CLIENT_AUTH)
-        ours.load_cert_chain(tmp_path / "robot" / "certificate.pem", tmp_path / "robot" / "key.pem")
-        trusted = ssl.create_default_context(cafile=str(tmp_path / "ca.pem"))
-    accepted = asyncio.Queue[asyncio.StreamWriter]()
-    server = await asyncio.start_server(
-        lambda _, writer: accepted.put_nowait(writer), "127.0.0.1", 0, ssl=ours
-    )
-    async with server, asyncio.timeout(5.0):
-        port = server.sockets[0].getsockname()[1]
-        reader, writer = await asyncio.open_connection("127.0.0.1", port, ssl=trusted)
-        transport = (await accepted.get()).transport
-        for _ in range(closed):
-            transport.close()
-        cut(transport)
-        cut(transport)
-        cut(None)
-        with suppress(ConnectionError):
-            assert await reader.read() == b""
-        writer.close()

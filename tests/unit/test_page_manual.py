@@ -110,16 +110,3 @@ async def test_without_a_manual_a_page_says_how_to_get_it(tmp_path: Path) -> Non
         ):
             assert (answer.status, answer.content_type) == (404, "text/html")
             assert "deploy/manual/build.py acsard/manual.zip" in await answer.text()
-
-
-async def test_a_client_that_leaves_in_the_middle_of_a_file_leaves_no_traceback(
-    tmp_path: Path, archive: Path, caplog: pytest.LogCaptureFixture
-) -> None:
-    async with served(tmp_path, archive) as (url, _):
-        reader, writer = await asyncio.open_connection(url.host, url.port, limit=1)
-        asked = f"GET /docs/assets/search.json HTTP/1.1\r\nHost: {url.host}\r\n\r\n"
-        writer.write(asked.encode() * 3)
-        await reader.read(1)
-        writer.transport.abort()
-        await asyncio.sleep(0.2)
-    assert caplog.records == []

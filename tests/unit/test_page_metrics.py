@@ -85,24 +85,6 @@ def test_the_inputs_and_the_battery_of_the_board_are_samples_if_it_reports_them(
     assert not any(word in name for name, _ in none for word in ("emergency", "bumper", "battery"))
 
 
-def test_refusals_are_reported_once_in_one_line_by_reason() -> None:
-    counts = Counts()
-    assert counts.new_refusals() is None
-    for _ in range(12):
-        counts.refuse("bad_token")
-    counts.refuse("origin")
-    event = counts.new_refusals()
-    assert event is not None
-    assert (event.name, event.level, event.count) == ("page_refused", "warning", 13)
-    assert event.text == "12 bad token, 1 origin"
-    assert counts.new_refusals() is None
-    counts.refuse("origin")
-    event = counts.new_refusals()
-    assert event is not None
-    assert event.text == "1 origin"
-    assert counts.refused() == {"bad_token": 12, "origin": 2}
-
-
 def test_each_line_names_the_client_with_the_most_refusals_since_the_last_line() -> None:
     counts = Counts()
     for _ in range(3):

@@ -15,14 +15,6 @@ from acsard.web.callers import RequestRefusedError
 from acsard.web.recordings import BlackBox, Recording, rows
 
 
-def test_a_file_that_the_daemon_deletes_meanwhile_does_not_hide_the_others(
-    tmp_path: Path,
-) -> None:
-    names = ["000001-20261121T070027Z.rec.zst", "000002-20261121T070127Z.rec.zst"]
-    (tmp_path / names[1]).write_bytes(b"")
-    assert [row.name for row in rows(tmp_path / name for name in names)] == names[1:]
-
-
 def test_a_recording_is_listed_with_its_beginning_and_its_duration(tmp_path: Path) -> None:
     path = tmp_path / "000001-20261121T070027Z.rec.zst"
     path.write_bytes(b"1234")

@@ -240,13 +240,6 @@ def samples(session: zenoh.Session) -> list[zenoh.Sample]:
     return [subscriber.recv(), subscriber.recv()]
 
 
-def test_an_answer_older_than_a_published_message_is_ignored(samples: list[zenoh.Sample]) -> None:
-    stream = Stream()
-    stream.take(samples[1])
-    stream.answered(samples[0])
-    assert stream.value()[:2] == (1, b"2")
-
-
 def test_the_age_of_a_message_counts_a_suspend(
     samples: list[zenoh.Sample], monkeypatch: pytest.MonkeyPatch
 ) -> None:

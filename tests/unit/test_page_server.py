@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import _thread
 import asyncio
-import errno
 import io
 import os
 import socket
-from concurrent.futures import Future
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -29,7 +27,6 @@ from acsard.web.listen import (
     invitations,
     open_sockets,
     own_name,
-    page_urls,
     parse_listen,
     require_certificate,
 )
@@ -80,13 +77,6 @@ def test_an_invitation_has_the_certified_addresses_at_which_the_server_listens(
     older = [at for at in own_addresses() if ":" not in at]
     newer = [f"[{at}]" for at in own_addresses() if ":" in at and host == "::"]
     assert urls == [f"https://{at}:8443/" for at in (*older, *newer, own_name())]
-
-
-def test_the_reported_addresses_of_the_page_are_those_of_an_invitation(tls: str) -> None:
-    away, here = Listen(True, "0.0.0.0", 8443), Listen(False, "127.0.0.1", 8080)
-    assert page_urls(away, tls) == invitations([away], tls)
-    assert f"https://{own_name()}:8443/" in page_urls(away, tls)
-    assert page_urls(here, "") == ["http://127.0.0.1:8080/"]
 
 
 def test_the_lines_at_the_start_name_each_page_and_the_manual_that_it_serves() -> None:
@@ -188,36 +178,6 @@ async def test_one_thread_waits_for_a_hanging_disk_and_then_everything_is_read_a
         log.close()
 
 
-def test_a_new_certificate_that_cannot_be_loaded_is_tried_again_and_reported_once(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(certificate_watch, "FILES_CHECK_PERIOD_NS", 0)
-    authority = Authority.make(tmp_path, "test", 10)
-    authority.issue(tmp_path, "robot", ["192.168.0.1"], 10)
-    lines = io.StringIO()
-    log = Log(LogConfig(), lines)
-    certificate = Certificate(str(tmp_path), log)
-    load = certificate._load
-
-    def out_of_files() -> None:
-        raise OSError(errno.EMFILE, "Too many open files")
-
-    monkeypatch.setattr(certificate, "_load", out_of_files)
-    authority.issue(tmp_path, "robot", ["192.168.0.2"], 10)
-    for _ in range(5):
-        certificate.read()
-    monkeypatch.setattr(certificate, "_load", load)
-    assert "192.168.0.2" not in certificate.names
-    before = certificate.context
-    certificate.read()
-    assert "192.168.0.2" in certificate.names
-    after = certificate.context
-    certificate.read()
-    assert before is not after is certificate.context
-    log.close()
-    assert lines.getvalue().count("cannot use its new TLS certificate") == 1
-
-
 async def test_the_connections_of_a_revoked_token_end_with_the_reading_that_misses_it(
     tmp_path: Path,
 ) -> None:
@@ -238,13 +198,3 @@ async def test_the_connections_of_a_revoked_token_end_with_the_reading_that_miss
     finally:
         ticking.cancel()
         log.close()
-
-
-async def test_an_error_of_the_outbox_is_reported_even_after_its_future_was_waited_for() -> None:
-    """The end of the server must not cancel the future that reports the error."""
-    outbox: Any = SimpleNamespace(dead=Future())
-    await server.first_ended([asyncio.sleep(0)], outbox)
-    assert not outbox.dead.cancelled()
-    outbox.dead.set_exception(MemoryError("no room"))
-    with pytest.raises(MemoryError):
-        await server.first_ended([asyncio.sleep(60)], outbox)

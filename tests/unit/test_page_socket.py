@@ -12,9 +12,7 @@ from unittest.mock import AsyncMock, Mock
 import aiohttp
 import msgspec
 import pytest
-from aiohttp import web
 from aiohttp.test_utils import make_mocked_request
-from msgspec.structs import replace
 
 from acsard.bus.address import Address
 from acsard.core.messages.schema import Beat, ServiceReply
@@ -22,23 +20,13 @@ from acsard.core.values import Role
 from acsard.web.callers import AdmittedClient
 from acsard.web.followed_robot import About, FollowedRobot
 from acsard.web.metrics import Counts
-from acsard.web.socket_sender import Following, Outgoing
-from acsard.web.streams import Stream, Streams
+from acsard.web.socket_sender import Outgoing
+from acsard.web.streams import Streams
 from acsard.web.viewer import Parts, Viewer
 from tests.unit.test_page_messages import INVALID_STOPS
 
 REQUEST = make_mocked_request("GET", "/ws")
 STREAMS = Streams()
-
-
-async def test_earlier_messages_do_not_delay_a_key_that_is_due_soon() -> None:
-    out = Outgoing(web.WebSocketResponse(), REQUEST, STREAMS, Counts(), "")
-    subscription = Following("state", 0.1, Stream())
-    due = await out._send_due(subscription, 100.03)
-    assert abs(due - 100.1) < 1e-6
-    woken = [await out._send_due(subscription, now) for now in (100.04, 100.07, 100.099)]
-    assert woken == [due] * 3
-    assert await out._send_due(subscription, due) > due
 
 
 class Socket:
@@ -193,16 +181,6 @@ async def test_a_flood_of_messages_leaves_each_other_client_its_turn() -> None:
         await page.viewer.run()
     other.cancel()
     assert turns > 900
-
-
-async def test_the_greeting_is_sent_again_only_after_a_change() -> None:
-    page = Page("viewer")
-    robot, out = page.viewer._robot, page.viewer._out._out
-    page.viewer._greet()
-    for linear, sent in ((1.0, 1), (0.5, 2), (0.5, 2)):
-        robot.about = replace(robot.about, linear=linear)  # of the query every ten seconds
-        page.viewer._look_around(0.0)
-        assert len([text for text, _ in out if b"hello" in text]) == sent
 
 
 async def test_every_press_is_answered_by_a_stop_that_was_sent_after_it() -> None:

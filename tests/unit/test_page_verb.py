@@ -39,11 +39,3 @@ def test_a_visitor_is_invited_for_an_hour_which_the_link_and_the_list_say(
     assert ", for 30 d; the link" in told("invite", "operator")
     rows = told("tokens").splitlines()
     assert [row.rpartition(", ")[2] for row in rows] == ["1 h left", "30 d left"]
-
-
-def test_a_second_robot_of_the_same_user_has_tokens_of_its_own(told: Callable[..., str]) -> None:
-    told("invite", "operator", "--name", "phone")
-    told("invite", "viewer", "--name", "phone", robot="robot2")
-    assert "operator" in told("tokens")
-    assert "operator" not in told("tokens", robot="robot2")
-    assert "no tokens for the robot robot3" in told("tokens", robot="robot3")

@@ -133,22 +133,6 @@ async def test_a_client_that_stops_reading_later_gets_only_the_newest_message(
         assert sum("value" in frame for frame in ours.heard) < number - 5
 
 
-async def test_a_client_that_unsubscribes_and_disconnects_leaves_no_subscription(
-    whole: Whole,
-) -> None:
-    streams = whole.robot.streams
-    async with whole.hands() as ours:
-        await ours.say(subscribe="odom", rate=50)
-        await eventually(lambda: "odom" in streams._streams)
-        streams.update(Mock())
-        # The server reads both messages at once.
-        await ours.say(unsubscribe="odom")
-        await ours.socket.close()
-        await eventually(lambda: not whole.page._viewers)
-        streams.update(Mock())
-        assert "odom" not in streams._streams
-
-
 async def test_a_client_on_the_robot_has_the_role_of_the_configuration(tmp_path: Path) -> None:
     whole = Whole(tmp_path, WebConfig(local="operator"))
     async with whole.hands() as ours:
@@ -157,14 +141,6 @@ async def test_a_client_on_the_robot_has_the_role_of_the_configuration(tmp_path:
         assert "set" in hello["barred"]
         assert not (await ours.call("set", settings={}))["ok"]
     assert whole.counts.refused() == {"role": 1}
-
-
-async def test_a_command_of_an_unknown_source_is_refused(whole: Whole) -> None:
-    async with whole.hands() as program:
-        program.source = "nobody"
-        await program.drive(0.1)
-        refused = await program.find(lambda message: message.get("refused") == "cmd")
-        assert "nobody is not one of the robot's sources: teleop, app" in refused["reason"]
 
 
 async def test_only_a_page_of_a_listed_origin_may_send_requests_and_read_answers(
