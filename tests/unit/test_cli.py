@@ -142,20 +142,6 @@ def test_each_silence_is_explained_once(
         assert capsys.readouterr().err == "acsard: the way to it is cut\n"
 
 
-def test_a_silence_without_a_found_cause_is_looked_at_again(
-    reasons: dict[str, str], capsys: pytest.CaptureFixture[str]
-) -> None:
-    silence = Silence(ROBOT, "")
-    reasons["later"] = ""
-    silence.look(FIRST_STATE_TIMEOUT_S)
-    reasons["later"] = "its certificate has ended"
-    silence.look(1.9 * FIRST_STATE_TIMEOUT_S)
-    assert capsys.readouterr().err == ""
-    silence.look(2 * FIRST_STATE_TIMEOUT_S)
-    silence.explain()  # the timeout ends it
-    assert capsys.readouterr().err == "acsard: its certificate has ended\n"
-
-
 def test_ways_are_metres_and_degrees_in_their_directions() -> None:
     words = ["forward", "1", "left", "90", "back", "0.5", "right", "45"]
     assert _parsed(words) == [(False, 1.0), (True, 90.0), (False, -0.5), (True, -45.0)]
@@ -181,17 +167,6 @@ def test_an_interrupted_drive_prints_how_far_it_came_and_what_is_wrong(
     out, err = capsys.readouterr()
     assert "+0.530 m" in out
     assert "WARNING: wheel fault: the rear left wheel does not turn" in err
-
-
-def test_without_its_library_it_says_which_extra_to_install(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    for name in [name for name in sys.modules if name.startswith("acsard.foxglove")]:
-        monkeypatch.delitem(sys.modules, name)
-    monkeypatch.setitem(sys.modules, "foxglove", None)  # as if the library were not installed
-    with pytest.raises(MendableError, match=r"pipx? install .*\[foxglove(,tools)?\]'") as error:
-        foxglove.main(argparse.Namespace())
-    assert error.value.code == Exit.FAILURE
 
 
 # the address: viewers may connect only from this machine

@@ -15,12 +15,11 @@ from acsard.cli import parser, run
 from acsard.cli.check import main
 from acsard.cli.common import load, overrides, with_record_directory
 from acsard.cli.connection import require_readable, robot_address
-from acsard.client.connection import open_connection
 from acsard.core.config.parsing import parse
 from acsard.core.config.settings import Config, McuConfig, WebConfig
 from acsard.host import config_file
 from acsard.host.config_file import SEARCH_PATHS, find
-from acsard.host.errors import Exit, MendableError, UnreachableError, UsageError
+from acsard.host.errors import Exit, MendableError, UsageError
 from acsard.host.version import version
 from acsard.machine.doctor import OPTION_KEYS
 
@@ -115,21 +114,6 @@ def test_the_options_of_a_tool_win_over_the_configuration(places: Places) -> Non
     places.fill()
     assert address_of(places.option, "tcp/10.0.0.1:1", "r8") == ("tcp/10.0.0.1:1", "r8", "")
     assert address_of(places.option, robot_id="r8") == ("tcp/127.0.0.1:7448", "r8", "")
-
-
-def test_a_file_with_a_router_whose_mode_is_peer_may_be_of_a_computer_without_a_daemon(
-    places: Places,
-) -> None:
-    places.option.write_text('[bus]\nconnect = ["tls/router:7447"]\ntls = "/home/a"\n')
-    args = argparse.Namespace(config=str(places.option), connect="tcp/127.0.0.1:1", id=None, tls="")
-    assert not robot_address(args).advice
-    args.connect = None
-    where = robot_address(args)._replace(endpoint="tcp/127.0.0.1:1")
-    with (
-        pytest.raises(UnreachableError, match="if this computer has no daemon"),
-        open_connection(where),
-    ):
-        pass
 
 
 def test_a_certificate_goes_with_a_tls_endpoint_only(

@@ -36,23 +36,13 @@ def test_a_message_is_its_json_on_one_line(form: Format, named: bool) -> None:
 @each(
     ("encoding", "payload"),
     [
-        ("", b""),
-        ("", b"stop"),
-        ("", b"[1]"),
-        ("", b'{"a":'),
-        ("", b'{"a":1} x'),
-        ("", b'{"a":"\xff"}'),
-        ("", b"\x81\xa1a"),
-        ("", b"\x81\xa1a\xa1\xff"),
-        ("", b"\x00\x01\x00\x00"),
-        ("application/json", b"\x80"),
-        ("application/msgpack", b"\xc1"),
-        ("application/msgpack", b"{}"),
-        ("application/cdr", b""),
-        ("application/cdr", b"\x05"),
+        ("", b""), ("", b"stop"), ("", b"[1]"), ("", b'{"a":'), ("", b'{"a":1} x'),
+        ("", b'{"a":"\xff"}'), ("", b"\x81\xa1a"), ("", b"\x81\xa1a\xa1\xff"),
+        ("", b"\x00\x01\x00\x00"), ("application/json", b"\x80"), ("application/msgpack", b"\xc1"),
+        ("application/msgpack", b"{}"), ("application/cdr", b""), ("application/cdr", b"\x05"),
         ("application/cdr", b"\x81\xa1a\x01"),
     ],
-)
+)  # fmt: skip
 def test_an_undecodable_payload_is_shown_as_its_bytes(encoding: str, payload: bytes) -> None:
     assert msgspec.json.decode(json_line(encoding, payload)) == {"undecodable": repr(payload)}
 
@@ -148,25 +138,8 @@ def test_messages_without_a_time_between_them_have_no_rate(times: list[float]) -
 def test_the_rate_of_three_messages_equals_the_one_computed_by_hand() -> None:
     # The gaps are 10 and 20 ms: mean 15, deviation 5, and the 99th percentile lies 99 % of the way
     # up.
-    assert rate_text([1.0, 1.01, 1.03]).split() == (
-        [
-            "66.67",
-            "Hz",
-            "gaps",
-            "ms:",
-            "min",
-            "10.00",
-            "p50",
-            "15.00",
-            "p99",
-            "19.90",
-            "max",
-            "20.00",
-            "std",
-            "5.00",
-            "n",
-            "3",
-        ]
+    assert " ".join(rate_text([1.0, 1.01, 1.03]).split()) == (
+        "66.67 Hz gaps ms: min 10.00 p50 15.00 p99 19.90 max 20.00 std 5.00 n 3"
     )
 
 

@@ -11,7 +11,6 @@ from typing import Any, cast
 import pytest
 import zenoh
 from msgspec.structs import replace
-from rich.console import Console
 
 from acsard.bus.address import Address
 from acsard.bus.subscription import Subscription
@@ -21,15 +20,11 @@ from acsard.client.follower import (
 )
 from acsard.core.messages.encodings import DecodeError
 from acsard.core.messages.schema import Info, RobotState, Time
-from acsard.core.values import NS_PER_S
-from acsard.host import clock as clocks
-from acsard.host.errors import ReplyError
 from acsard.top import feed as top_feed
 from acsard.top import roster as rosters
-from acsard.top import terminal
 from acsard.top.feed import Feed
 from acsard.top.fleet_table import table
-from acsard.top.roster import Roster, Row
+from acsard.top.roster import Roster
 from tests.unit.screens import BEFORE, INFO, STATE, drawn, sample_of
 
 
@@ -112,20 +107,6 @@ def test_the_robot_that_is_gone_for_longest_makes_room_for_a_new_one(
     assert fleet.left_out_text == ""
 
 
-def test_a_state_from_before_a_suspend_is_old(
-    session: Session, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """The age must include the suspend, in which the monotonic clock stands still."""
-    fleet = fleet_of(session)
-    session.announce("robot1")
-    fleet._state(sample_of(STATE, "acsard/robot1/state"))
-    slept_ns = clocks.asleep_ns() + 3600 * NS_PER_S
-    monkeypatch.setattr(clocks, "asleep_ns", lambda: slept_ns)
-    (row,) = fleet.rows()
-    assert row.silent
-    assert row.age >= 3600.0
-
-
 @pytest.mark.parametrize(
     ("ids", "answering", "here", "whole"),
     [
@@ -192,24 +173,6 @@ def test_a_daemon_that_hangs_is_silent_though_a_storage_answers_for_it(
     assert line_after(fleet, clock, 9.0).endswith("SILENT, was: commanded by app")
 
 
-@pytest.mark.parametrize("height", [1, 24])
-def test_a_terminal_of_any_height_shows_the_heading_and_the_last_line(
-    height: int, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    def watch(draw: Any, suspend: list[bool]) -> bool:
-        Console(width=80).print(draw(80, height))
-        return False
-
-    monkeypatch.setattr(terminal, "_watch", watch)
-    monkeypatch.setattr(terminal, "_run_suspendable", lambda shows: shows([]))
-    rows = [Row("robot1", True, STATE, 0.1)]
-    fleet = SimpleNamespace(rows=lambda: rows, left_out_text="", presence_text="1 robot")
-    terminal.roster(cast(Roster, fleet))
-    head, line, *_, last = capsys.readouterr().out.splitlines()
-    assert (head.split()[0], line.split()[0]) == ("ROBOT", "robot1")
-    assert last.rstrip() == "q quits   1 robot"
-
-
 # one robot
 
 KEY = "acsard/acsar/state"
@@ -273,26 +236,6 @@ def test_the_time_between_two_states_is_measured_by_the_viewer_s_clock(robot: Ro
     robot.state = at(9000)
     feed.query_state()
     assert feed.screen_data().passed == pytest.approx(0.8)
-
-
-@pytest.mark.parametrize("sec", [999, 1001])
-def test_the_later_of_an_answer_and_a_published_state_is_shown(robot: Robot, sec: int) -> None:
-    feed = feed_of(robot)
-    robot.state = at(1000)
-    robot.tells(at(sec, lines=1300 + sec - 1000))
-    feed.query_state()
-    feed.poll()
-    state = feed.screen_data().state
-    assert state is not None
-    assert state.stamp == Time(max(1000, sec))
-
-
-def test_a_state_of_another_version_is_reported_as_such(robot: Robot) -> None:
-    feed = feed_of(robot)
-    robot.state = DecodeError("wrong_shape", "unknown field")
-    with pytest.raises(ReplyError, match="a different version"):
-        feed.query_state()
-    assert feed.screen_data().undecodable == 1
 
 
 def test_the_rates_begin_again_when_another_daemon_answers(robot: Robot) -> None:

@@ -69,18 +69,6 @@ def test_a_number_is_asked_for_until_it_is_valid_and_within_its_bounds(
     assert capsys.readouterr().err.count("from 0.5 to 3") == 5
 
 
-def test_the_bar_is_full_only_when_keys_stop_nothing_any_more(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    master, slave = pty.openpty()
-    with open(slave, "w") as screen, open(master, "rb", buffering=0) as seen:
-        monkeypatch.setattr("sys.stderr", screen)
-        for share, full, keys in ((0.99, False, True), (1.0, True, False)):
-            TerminalPrompt().progress(share)
-            shown = seen.read(256)
-            assert (b"." not in shown, b"any key stops" in shown) == (full, keys)
-
-
 @pytest.mark.parametrize("asked", [lambda p: p.number(DISTANCE), lambda p: p.start("Go.")])
 def test_q_quits_at_every_question(
     terminal: Terminal, asked: Callable[[TerminalPrompt], object]

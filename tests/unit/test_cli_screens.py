@@ -170,9 +170,6 @@ def test_a_usual_screen_fits_80_by_24() -> None:
     assert len(lines_of(of(sources=five, counters=counters, refused=refused))) <= 24
 
 
-# robots of a fleet
-
-
 # any message from the bus
 
 HOSTILE = "\x1b[2J\x1b]0;x\x07[red]\u202e\x9b1m\n"

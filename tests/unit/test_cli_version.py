@@ -58,15 +58,6 @@ def test_the_commit_equals_that_of_git_in_each_layout_of_a_clone(clone: Path) ->
     assert commit_of(tree) == git(tree, "rev-parse", "HEAD") != commit_of(clone)
 
 
-def test_without_a_readable_clone_the_commit_is_empty(tmp_path: Path) -> None:
-    assert commit_of(tmp_path) == ""
-    (tmp_path / ".git").mkdir()
-    (tmp_path / ".git" / "HEAD").write_bytes(b"\xff\xfe")
-    assert commit_of(tmp_path) == ""
-    (tmp_path / ".git" / "HEAD").write_text("ref: refs/heads/none\n")
-    assert commit_of(tmp_path) == ""
-
-
 def test_a_changed_clone_is_dirty_and_an_ignored_file_changes_nothing(
     clone: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -19,7 +19,6 @@ from acsard.client.asynchronous import AsyncClient
 from acsard.client.connection import MIN_SPACING_S, Connection
 from acsard.client.driving import UnheardError
 from acsard.client.identity import ClientIdentity
-from acsard.client.ride import MAX_SOURCE_TIMEOUT_S
 from acsard.core.config.settings import Config, DriveConfig, JointsConfig
 from acsard.core.incoming.commands import Arrival, Receiver
 from acsard.core.incoming.queries import Queries, Query
@@ -32,7 +31,7 @@ from acsard.core.messages.schema import (
     ServiceReply,
 )
 from acsard.core.motion.kinematics import Kinematics
-from acsard.core.values import NS_PER_S, REST, Command, Echo, Status
+from acsard.core.values import REST, Command, Echo, Status
 from acsard.host import clock
 from acsard.host.errors import ReplyError
 from tests.each import each
@@ -141,23 +140,6 @@ def test_the_commands_of_two_threads_leave_in_their_order_and_with_the_pause(
     assert puts_s[1] - puts_s[0] >= MIN_SPACING_S
 
 
-@pytest.mark.timeout(10)
-def test_a_signal_handler_can_send_while_the_interrupted_thread_waits_to_send(
-    session: Session, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    client, sleep = client_of(session), time.sleep
-    client.send(0.0)
-
-    def interrupted(seconds: float) -> None:
-        monkeypatch.setattr(time, "sleep", sleep)
-        client.send(0.0)
-        sleep(seconds)
-
-    monkeypatch.setattr(time, "sleep", interrupted)
-    client.send(0.5)
-    assert len(session.heard) == 3
-
-
 def test_the_end_of_a_connection_sends_zeros_to_each_robot_that_may_still_move(
     session: Session, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -206,20 +188,6 @@ def test_while_a_connection_ends_other_threads_send_only_zeros(
     assert ["is being closed" in error for error in errors] == [True]
 
 
-def test_after_the_longest_timeout_the_end_of_a_connection_sends_no_zero(
-    session: Session, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    robot = client_of(session)
-    robot.send(0.0)
-    robot.send(0.3)
-    sent, asleep_ns = len(session.heard), clock.asleep_ns()
-    monkeypatch.setattr(
-        clock, "asleep_ns", lambda: asleep_ns + int(MAX_SOURCE_TIMEOUT_S * NS_PER_S)
-    )
-    robot.end()
-    assert len(session.heard) == sent
-
-
 def test_each_method_reports_a_closed_connection(session: Session) -> None:
     robot = client_of(session)
     session.close()
@@ -243,21 +211,6 @@ def without_states(robot: Connection, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(robot, "subscribe", lambda _: silence)
 
 
-def test_ctrl_c_ends_a_drive_whose_connection_is_closed_with_a_keyboard_interrupt(
-    session: Session, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def interrupted(_: float) -> None:
-        if not session.closed:
-            session.close()
-            raise KeyboardInterrupt
-
-    robot = client_of(session)
-    without_states(robot, monkeypatch)
-    monkeypatch.setattr(time, "sleep", interrupted)
-    with pytest.raises(KeyboardInterrupt):
-        Client(robot).drive(0.1, seconds=1.0)
-
-
 @pytest.mark.parametrize("method", ["pose", "whoami", "call", "get", "set"])
 async def test_an_async_call_that_takes_too_long_raises_a_documented_error(
     session: Session, monkeypatch: pytest.MonkeyPatch, method: str
@@ -272,17 +225,6 @@ async def test_an_async_call_that_takes_too_long_raises_a_documented_error(
             await getattr(robot, method)(**fields.get(method, {}))
     finally:
         released.set()
-
-
-async def test_an_async_call_without_a_new_thread_raises_a_documented_error(
-    session: Session,
-) -> None:
-    usual = threading.stack_size(1 << 46)  # no machine can provide a stack of this size
-    try:
-        with pytest.raises(AcsardError, match="cannot start another thread"):
-            await AsyncClient(client_of(session)).pose()
-    finally:
-        threading.stack_size(usual)
 
 
 @pytest.mark.parametrize("name", ["odm", "statte"])
@@ -383,10 +325,3 @@ def test_the_error_of_a_drive_names_the_role_if_it_may_be_the_reason(
     assert words in str(error)
     assert ("role" in str(error)) == ("role" in words)
     assert kind.__name__ in client.__doc__.split()
-
-
-def test_a_wrong_argument_of_drive_sends_nothing(session: Session) -> None:
-    robot = Client(client_of(session))
-    with pytest.raises(client.UsageError):
-        robot.drive(0.3, seconds=0.0)
-    assert session.heard == []

@@ -7,7 +7,6 @@ from collections.abc import Callable, Iterator
 from typing import Any
 
 import pytest
-import zenoh
 from msgspec.structs import replace
 
 from acsard.client.driving import (
@@ -24,7 +23,7 @@ from acsard.core.values import NS_PER_S
 from acsard.host import clock
 from acsard.host.errors import NoAnswerError, NotDrivenError, UsageError
 from tests.each import each
-from tests.unit.screens import raw_sample, sample_of
+from tests.unit.screens import sample_of
 
 US, OTHER = "joe/1/aa", "ann/2/bb"
 NEUTRAL = "send a zero first: app must send a zero"
@@ -290,28 +289,6 @@ def test_a_stored_state_of_a_dead_robot_does_not_keep_a_drive_running(
     assert world.asked
     assert world.passed <= dies + ROBOT_SILENCE_TIMEOUT_S + 0.3
     assert world.sent[-1] == 0.0
-
-
-def test_a_daemon_of_another_version_is_distinguished_from_a_dead_one() -> None:
-    world: Any = World(followed)
-    world._sample = lambda: raw_sample(b"{}")
-    with pytest.raises(NoAnswerError, match="another version"):
-        world.drive()
-
-
-def closed(*_: float) -> None:
-    raise zenoh.ZError("session closed")
-
-
-@each("call", ["try_recv", "send"])
-def test_a_closed_connection_ends_the_drive(call: str) -> None:
-    world = World(followed)
-    steps = world.steps()
-    next(steps)
-    setattr(world, call, closed)
-    world.now += 0.01
-    with pytest.raises(NoAnswerError, match="closed"):
-        next(steps)
 
 
 def test_a_wrong_number_is_refused_before_a_command_is_sent() -> None:

@@ -2,11 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import subprocess
-import sys
-import tempfile
-from collections.abc import Iterator
 from itertools import permutations
 from pathlib import Path
 from types import SimpleNamespace
@@ -74,38 +69,6 @@ def test_a_silent_robot_leads_to_questions_first_about_the_id_and_to_no_claim() 
 
 
 NOBODY_LISTENS = "tls/127.0.0.1:1"
-
-
-@pytest.fixture
-def shared() -> Iterator[Path]:
-    """Yield a directory that every user may enter, even when `tmp_path` is inside a private one."""
-    with tempfile.TemporaryDirectory() as name:
-        Path(name).chmod(0o755)
-        yield Path(name)
-
-
-AS_NOBODY = """\
-import os, sys
-from acsard.client import connect
-if os.geteuid() == 0:
-    os.setgroups([])
-    os.setgid(65534)
-    os.setuid(65534)
-try:
-    with connect(sys.argv[1], tls=sys.argv[2]):
-        pass
-except PermissionError as error:
-    print(error)
-"""
-
-
-def test_certificates_without_read_permission_raise_a_permission_error(shared: Path) -> None:
-    for name in ("ca.pem", "certificate.pem", "key.pem"):
-        (shared / name).write_text("of somebody else")
-        (shared / name).chmod(0o600 if os.geteuid() == 0 else 0)
-    words = [sys.executable, "-c", AS_NOBODY, NOBODY_LISTENS, str(shared)]
-    done = subprocess.run(words, capture_output=True, text=True, timeout=30.0, check=True)
-    assert str(shared / "ca.pem") in done.stdout
 
 
 def test_a_directory_without_certificates_is_reported_and_not_taken_for_a_missing_daemon(

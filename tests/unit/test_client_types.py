@@ -11,12 +11,9 @@ from typing import Any, get_args, get_overloads, get_type_hints
 import pytest
 
 from acsard.client import AsyncClient, Client
-from acsard.client.reads import FOLLOWED_KEYS, QUERIED_KEYS, AsyncReads, Reads, decoder
-from acsard.core.incoming.commands import Arrival
-from acsard.core.incoming.imu import reading
-from acsard.core.messages.encodings import FORMATS, DecodeError, encode
+from acsard.client.reads import FOLLOWED_KEYS, QUERIED_KEYS, AsyncReads, Reads
 from acsard.core.messages.keys_and_roles import by_key
-from acsard.core.messages.schema import MESSAGES, Imu, Vector3
+from acsard.core.messages.schema import MESSAGES
 from tests.each import each
 from tests.system.harness import ROOT
 
@@ -58,29 +55,6 @@ def test_both_clients_show_the_same_few_names() -> None:
             "call", "clear", "drive", "get", "messages", "move", "name", "pose", "send", "set",
             "stop", "turn", "whoami",
         }, client  # fmt: skip
-
-
-@each(
-    ("payload", "good"),
-    [
-        *((encode(Imu(angular_velocity=Vector3(z=0.5)), form), True) for form in FORMATS),
-        (b'{"angular_velocity":{"z":0.5}}', True),
-        (b"\x81\xb0angular_velocity\x81\xa1z\xcb?\xe0\x00\x00\x00\x00\x00\x00", True),
-        (b"{}", False), (b'{"angular_velocity":{"z":"0.5"}}', False),
-    ],
-)  # fmt: skip
-def test_an_imu_message_is_decoded_exactly_if_the_daemon_accepts_it(
-    payload: bytes, good: bool
-) -> None:
-    arrival = Arrival("imu", True, payload, "", 0, None, "")
-    if good:
-        rate = decoder("imu").decode("", payload).angular_velocity.z
-        assert rate == reading(arrival)[0].rate == 0.5
-        return
-    with pytest.raises(DecodeError):
-        reading(arrival)
-    with pytest.raises(DecodeError):
-        decoder("imu").decode("", payload)
 
 
 STUDENT = """\
