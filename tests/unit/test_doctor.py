@@ -14,13 +14,11 @@ import pytest
 from msgspec.structs import replace
 
 from acsard.bus.address import Address
-from acsard.bus.zenoh_sessions import answers
-from acsard.cli import main
 from acsard.core.config.settings import BusConfig, Config, McuConfig
 from acsard.core.messages.encodings import DecodeError
 from acsard.core.messages.schema import DiagnosticStatus, Info, KeyValue
 from acsard.host import real_time
-from acsard.host.errors import CertificateError, NoAnswerError, UsageError
+from acsard.host.errors import CertificateError, NoAnswerError
 from acsard.host.kernel_counters import Kernel
 from acsard.machine import doctor, versions
 from acsard.machine.doctor import Running, clocks, compared, examine, reported
@@ -113,24 +111,6 @@ def test_a_failed_query_of_the_daemon_has_advice_that_fits_its_error(
     assert finding.mend.endswith(mend) if mend else not finding.mend
 
 
-@pytest.mark.parametrize("host", ["a..b", "a" * 70])
-def test_a_host_that_cannot_exist_is_no_endpoint(host: str) -> None:
-    with pytest.raises(UsageError, match="endpoint"):
-        answers(f"tcp/{host}:7448")
-
-
-def test_control_characters_of_a_robot_do_not_reach_the_terminal(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    finding = Finding("daemon", "ok", "ready: \x1b]0;owned\x07\nFAIL", "type\x1b[2J\n  a = 1")
-    monkeypatch.setattr("acsard.cli.doctor.examine", lambda *_: [finding])
-    assert main(["doctor"]) == 0
-    text = capsys.readouterr().out
-    assert (
-        text == "ok    daemon: ready: \ufffd]0;owned\ufffd FAIL\n      -> type\ufffd[2J\n  a = 1\n"
-    )
-
-
 WANTED = True
 
 
@@ -188,11 +168,6 @@ def test_a_program_that_uses_the_port_in_place_of_the_daemon_is_a_failure() -> N
 def test_without_real_time_in_the_configuration_no_warning_is_given() -> None:
     (finding,) = scheduling(False, 77)
     assert finding.level == "ok"
-
-
-def test_a_computer_without_causes_of_lateness_is_ok(tmp_path: Path) -> None:
-    (finding,) = slowness(Kernel(write(tmp_path, QUIET)))
-    assert (finding.subject, finding.level) == ("computer", "ok")
 
 
 def test_each_present_cause_of_lateness_is_a_warning_with_a_remedy(tmp_path: Path) -> None:

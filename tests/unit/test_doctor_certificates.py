@@ -113,23 +113,6 @@ def test_the_advised_command_makes_the_first_certificate_of_an_empty_directory(
     assert finding(directory).level == "ok"
 
 
-def test_the_advised_command_replaces_a_missing_key_beside_the_authoritys_key(
-    fleet: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    (fleet / "key.pem").unlink()
-    typed(next(iter(certificates(str(fleet)))).mend, fleet, monkeypatch)
-    assert finding(fleet).level == "ok"
-
-
-@pytest.mark.skipif(os.geteuid() == 0, reason="root may write everywhere")
-def test_for_a_directory_of_root_sudo_with_the_program_path_is_advised(fleet: Path) -> None:
-    Authority.load(fleet, str).issue(fleet, "robot", ["localhost"], 9.9)
-    fleet.chmod(0o555)
-    # Outside an activated environment the command names the Python.
-    program = r"/\S+(acsard| -m acsard)"
-    assert re.match(rf"run `sudo {program} tls renew --directory ", finding(fleet).mend)
-
-
 @pytest.fixture
 def other_user() -> Iterator[None]:
     """Run the test as a user who is not root, if root runs the tests."""

@@ -6,7 +6,6 @@ import asyncio
 import os
 import subprocess
 import sys
-import time
 from collections.abc import Callable, Coroutine, Iterator
 from contextlib import contextmanager
 from typing import Any
@@ -14,53 +13,10 @@ from typing import Any
 import pytest
 
 from acsard.core.values import NS_PER_S
-from acsard.host import clock
 from acsard.host.clock import MIN_SUSPEND_NS, SuspendDetector
 from acsard.host.event_loop import EventLoop
 from acsard.host.wait_timer import MAX_CALL_INTERVAL_NS, WaitTimer
 from tests.unit.privileges import WITHOUT_RAISING_LIMITS
-
-WALL_NS = 1_800_000_000_000_000_000
-
-
-class Machine:
-    """A machine that suspends this process for 0.2 s, for the first `takes` times.
-
-    It does so right before each reading of the wall clock.
-    """
-
-    def __init__(self, takes: int) -> None:
-        self.takes, self.ns = takes, 5_000_000_000
-
-    def mono_ns(self) -> int:
-        self.ns += 1500
-        return self.ns
-
-    def wall_ns(self) -> int:
-        if self.takes:
-            self.takes -= 1
-            self.ns += 200_000_000
-        return WALL_NS + self.ns
-
-
-@pytest.mark.parametrize("takes", [0, 1, 3])
-def test_both_clocks_are_read_at_the_same_moment(
-    monkeypatch: pytest.MonkeyPatch, takes: int
-) -> None:
-    machine = Machine(takes)
-    monkeypatch.setattr(clock, "mono_ns", machine.mono_ns)
-    monkeypatch.setattr(time, "time_ns", machine.wall_ns)
-    at = clock.now()
-    assert at.wall_ns - at.mono_ns == WALL_NS
-
-
-def test_reading_both_clocks_stops_retrying_on_a_slow_machine(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    machine = Machine(1000)
-    monkeypatch.setattr(clock, "mono_ns", machine.mono_ns)
-    monkeypatch.setattr(time, "time_ns", machine.wall_ns)
-    assert clock.now().wall_ns - WALL_NS == (machine.ns - 1500) // 1000 * 1000
 
 
 def test_each_suspend_is_reported_once() -> None:

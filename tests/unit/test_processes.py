@@ -16,9 +16,8 @@ from acsard.host import processes
 from acsard.host.child import (
     acsard,
 )
-from acsard.host.processes import holder_of, holders, master_of, name_of, waited_ns
+from acsard.host.processes import holder_of, holders, master_of, name_of
 from tests.each import each
-from tests.system.harness import until
 
 HOLD = """\
 import fcntl, os, sys
@@ -118,19 +117,3 @@ def test_only_a_process_that_executes_acsard_has_its_name_and_a_daemon_runs_run(
     (tmp_path / "1" / "comm").write_text("other\n")
     assert name_of(1) == name.removesuffix(" run")
     assert processes.is_daemon_here(1) is name.endswith(" run")
-
-
-def test_the_time_that_a_process_waited_for_a_processor_is_read() -> None:
-    spin = "import os; os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})\nwhile True: pass"
-    two = [subprocess.Popen([sys.executable, "-c", spin]) for _ in range(2)]
-    try:
-        until(
-            lambda: all(waited_ns(process.pid) > 20_000_000 for process in two),
-            20.0,
-            "both have waited",
-        )
-    finally:
-        for process in two:
-            process.kill()
-            process.wait()
-    assert waited_ns(two[0].pid) == 0  # the process has ended

@@ -29,7 +29,6 @@ from acsard.host.child import (
     Child,
     Parent,
     Silence,
-    acsard,
     end,
     environment,
     how_it_ended,
@@ -133,12 +132,6 @@ def test_a_child_has_its_own_session_and_no_notify_socket_of_its_parent(
     assert "MORE" in environment()
 
 
-def test_the_command_runs_the_installed_package() -> None:
-    command = acsard("--version")
-    assert command[1] in ("-P", "-I")  # the latter in /opt/acsard
-    assert subprocess.run(command, capture_output=True, check=True).stdout.startswith(b"acsard ")
-
-
 # the end by signals
 
 
@@ -189,16 +182,6 @@ def test_a_child_ends_when_its_parent_is_killed() -> None:
 # the parent, as the child sees it
 
 
-@pytest.mark.slow
-def test_signs_of_life_reach_the_parent_and_never_block_the_child() -> None:
-    ours, its = socket.socketpair()
-    with ours, its:
-        parent = Parent(its.fileno())
-        for _ in range(100_000):  # more than the socket holds
-            parent.beat()
-        assert set(ours.recv(1 << 20)) == set(b".")
-
-
 def test_a_parent_that_closed_its_end_is_gone_and_beats_raise_no_error() -> None:
     ours, its = socket.socketpair()
     with its:
@@ -213,15 +196,6 @@ def test_a_parent_that_closed_its_end_is_gone_and_beats_raise_no_error() -> None
         parent.beat()
 
 
-def test_a_parent_is_gone_when_its_end_of_the_pipe_is_closed() -> None:
-    reads, writes = os.pipe()
-    parent = Parent(reads)
-    parent.beat()
-    os.close(writes)
-    assert parent.is_gone()
-    os.close(reads)
-
-
 # the silence of a child
 
 
@@ -232,13 +206,6 @@ MOST = 3 * S
 def test_a_silence_is_too_long_when_it_exceeds_the_limit() -> None:
     silence = Silence(MOST)
     assert [silence.too_long(False, S // 2) for _ in range(7)] == [False] * 6 + [True]
-
-
-def test_a_sign_of_life_restarts_the_time_limit_of_the_silence() -> None:
-    silence = Silence(MOST)
-    for _ in range(5):
-        assert not any(silence.too_long(False, S // 2) for _ in range(6))
-        assert not silence.too_long(True, S // 2)
 
 
 @given(st.lists(st.integers(0, 10**13), max_size=6))

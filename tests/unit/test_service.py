@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import resource
 from pathlib import Path
 
 import pytest
@@ -151,16 +150,6 @@ def test_the_files_are_those_of_deploy_with_the_port_of_a_real_robot() -> None:
     assert b'port = "/dev/acsar"' in configuration.content
 
 
-def test_an_installation_never_selects_the_simulator(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    changed = tmp_path / "acsard.toml"
-    changed.write_text("[mcu]\nport='sim'\n")
-    monkeypatch.setattr(service_installation, "reference", lambda deploy: changed)
-    with pytest.raises(AssertionError):
-        files()
-
-
 DROP_IN = File(
     Path("/etc/x/lan.conf"),
     b"IPAddressAllow=10.0.0.0/8\nLoadCredential=key.pem:/a/b/key.pem\n"
@@ -191,18 +180,6 @@ def test_after_a_write_and_a_removal_the_directory_is_unchanged(tmp_path: Path) 
     assert file.condition() == "missing"
 
 
-def test_a_full_disk_leaves_no_part_of_a_file(tmp_path: Path) -> None:
-    # A part of the configuration would be kept as the user's own. An empty one is the simulator.
-    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (4096, hard))
-    try:
-        with pytest.raises(OSError, match="too large"):
-            Write(File(tmp_path / "acsard.toml", bytes(20_000), kept=True)).do()
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
-    assert not list(tmp_path.iterdir())
-
-
 def test_a_failing_command_ends_the_installation_unless_its_failure_is_permitted() -> None:
     words = ("sh", "-c", "echo no >&2; exit 1")
     with pytest.raises(MendableError, match="no"):
@@ -210,14 +187,6 @@ def test_a_failing_command_ends_the_installation_unless_its_failure_is_permitted
     Run(words, may_fail=True).do()
     with pytest.raises(MendableError, match="no such program"):
         Run(("no such program",)).do()
-
-
-def test_an_unreadable_file_is_reported_in_a_sentence(tmp_path: Path) -> None:
-    place = File(tmp_path / "acsard.toml", b"")
-    place.path.mkdir()
-    assert place.condition() == "unreadable"
-    with pytest.raises(MendableError, match=r"cannot read .*acsard\.toml"):
-        place.current_content()
 
 
 @each("action", ["install", "uninstall"])

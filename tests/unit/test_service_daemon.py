@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import _thread
 import asyncio
 import os
 import signal
@@ -105,14 +104,6 @@ def test_a_program_that_cannot_be_started_is_reported(monkeypatch: pytest.Monkey
     assert (event.name, event.level) == ("gateway_ended", "warning")
 
 
-def test_a_thread_that_cannot_be_started_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
-    def full(*_: object) -> None:
-        raise RuntimeError("can't start new thread")
-
-    monkeypatch.setattr(_thread, "start_new_thread", full)
-    assert asyncio.run(first_event()).name == "gateway_ended"
-
-
 def program(monkeypatch: pytest.MonkeyPatch, where: Path, text: str) -> None:
     """Replace the `acsard` program by a script with this text."""
     file = where / "program"
@@ -169,21 +160,3 @@ def test_a_program_is_started_again_unless_it_never_ran_or_a_person_ended_it(
     assert {(event.name, event.level) for event in events} == {(kind.ended, "warning")}
     told = [f"it is not restarted: {kind.remedy}" in event.text for event in events]
     assert told == [False] * (len(events) - 1) + [result is not None]
-
-
-def test_the_first_page_that_could_be_started_counts_as_the_first(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    """If the system refuses to start the process, this says nothing about the page's files."""
-    monkeypatch.setattr("acsard.daemon.supervisor.LONG_RESTART_PAUSE_S", 0.01)
-    program(monkeypatch, tmp_path, "raise SystemExit(78)")
-    executable = sys.executable
-    monkeypatch.setattr(sys, "executable", "/nowhere/python")
-    events: list[Event] = []
-
-    def log(event: Event) -> None:
-        events.append(event)
-        monkeypatch.setattr(sys, "executable", executable)
-
-    assert asyncio.run(keep_running(["web"], log, PAGE)) == 78
-    assert [PAGE.remedy in event.text for event in events] == [False, True]

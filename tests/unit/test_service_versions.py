@@ -11,7 +11,6 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from acsard.bus.address import Address
 from acsard.host.errors import MendableError
 from acsard.machine import upgrade, versions
 from acsard.machine.upgrade import Look, UnitState, prepare, worse
@@ -59,22 +58,6 @@ def test_a_newer_version_that_is_not_in_use_is_found(tmp_path: Path) -> None:
     assert versions.unused(tmp_path) == ""
     versions.use("0.2.0", tmp_path)
     assert versions.unused(tmp_path) == "0.3.0"
-
-
-def test_what_a_killed_removal_leaves_is_no_version_and_is_removed_by_the_next_change(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    versions_in(tmp_path, "0.1.0", "0.2.0", "0.3.0")
-    versions.use("0.2.0", tmp_path)
-    versions.use("0.3.0", tmp_path)
-    monkeypatch.setattr(os, "unlink", lambda *_, **__: (_ for _ in ()).throw(KeyboardInterrupt))
-    with pytest.raises(KeyboardInterrupt):
-        versions.remove_others(tmp_path)
-    assert versions.installed(tmp_path) == ["0.2.0", "0.3.0"]
-    monkeypatch.undo()
-    with versions.changing(tmp_path):
-        left = {path.name for path in tmp_path.iterdir()}
-    assert left == {"0.2.0", "0.3.0", "current", "previous"}
 
 
 def test_the_launcher_imports_from_its_own_version_also_after_a_switch(tmp_path: Path) -> None:
@@ -238,13 +221,3 @@ def test_a_version_that_cannot_be_started_is_left_again(
         upgrade.change("1.1.0", print)
     assert used == ["1.0.0", "1.1.0", "0.9.0", "1.0.0"]
     assert started == ["1.1.0", "1.0.0"]
-
-
-def test_a_version_under_which_systemd_does_not_answer_does_not_work(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    def silent(unit: str) -> UnitState:
-        raise MendableError("systemctl show: timed out")
-
-    monkeypatch.setattr(upgrade, "unit_state", silent)
-    assert "timed out" in upgrade.watch(Address("tcp/127.0.0.1:1", "r", ""), None, ["x"], 0.0)
