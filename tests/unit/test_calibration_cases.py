@@ -135,16 +135,6 @@ def test_a_gyro_that_hangs_is_used_up_to_there(tmp_path: Path) -> None:
     assert any("yaw_rate repeats" in note and "from 45 s" in note for note in result.notes)
 
 
-def test_two_frames_on_a_topic_are_refused_with_the_cause(tmp_path: Path) -> None:
-    def gyro(made: Bag, t: float, rate: float) -> None:
-        made.imu(START + t, START + t, rate)
-        made.imu(START + t + 0.001, START + t, 0.0, "lidar_imu")
-
-    made = bag(gyro=gyro).write(tmp_path / "drive")
-    with pytest.raises(SystemExit, match="imu_link and lidar_imu, so two programs"):
-        converted(made, *GYRO)
-
-
 def test_poses_whose_y_axis_points_up_need_the_option_that_the_error_names(tmp_path: Path) -> None:
     made = bag(gyro=None, pose_hz=20.0, pose=lambda b, t, x, y, yaw: b.pose(
         START + t, START + t, (x, 0.02, -y), yaw, axis=1))  # fmt: skip

@@ -15,7 +15,7 @@ from msgspec import structs
 from acsard.calibration.fit import BIAS, GYRO_DELAY, fit
 from acsard.calibration.log import LogError, TapeReading
 from acsard.core.config.settings import Config
-from tests.unit.calibration_logs import WAYS, fitted, ideal, multipliers, run, runs, usual
+from tests.unit.calibration_logs import WAYS, fitted, ideal, multipliers, run, usual
 from tests.unit.calibration_robots import (
     GUIDED,
     RADIUS,
@@ -204,16 +204,3 @@ def test_a_gyro_that_is_late_biased_and_interrupted_gives_the_same_track() -> No
 def test_a_log_without_a_sensor_beside_the_wheels_is_refused() -> None:
     with pytest.raises(LogError, match="no gyro and no positions"):
         fitted(usual(), gyro=False, places=False)
-
-
-@pytest.mark.slow
-def test_145_short_runs_take_a_few_seconds() -> None:
-    import time
-
-    made = runs(manoeuvres(1, 145, 0.05))
-    begun = time.process_time()
-    found = fit(made, Config())
-    took = time.process_time() - begun
-    print(f"{took:.1f} s")
-    assert found.better
-    assert took < 15.0

@@ -79,11 +79,6 @@ def test_the_column_run_names_the_runs() -> None:
     assert [run.name for run in log.runs] == ["square", "turns", "turns.2"]
 
 
-def test_a_log_of_one_row_a_second_is_one_run() -> None:
-    rows = [f"{0.79 * n:.3f},2,2,0.01" for n in range(60)]
-    assert len(read(text(rows)).runs) == 1
-
-
 def test_single_wrong_cells_are_left_out_with_a_note() -> None:
     rows = lines()
     rows[50] = "2.5,5000,2,0.05"
@@ -96,13 +91,6 @@ def test_a_dead_wheel_is_refused_and_named() -> None:
     rows = [f"{0.05 * n:.3f},2,2,0,2,0.1" for n in range(200)]
     with pytest.raises(LogError, match="rl rolls otherwise than fl"):
         read(text(rows, "t,fr,fl,rl,rr,yaw_rate"))
-
-
-def test_positions_that_are_repeated_in_later_rows_count_once() -> None:
-    rows = [f"{0.05 * n:.3f},2,2,{0.1 * (n // 4)},0" for n in range(200)]
-    log = read(text(rows, "t,left,right,x,y"))
-    assert len(log.runs[0].place) == 50
-    assert log.notes == ("rows of x y and yaw left out, because they repeat the row before: 150",)
 
 
 def test_a_distance_is_that_of_the_straightest_run_or_of_the_named_one() -> None:

@@ -274,21 +274,3 @@ def test_a_gyro_alone_shows_no_noise_of_the_distance() -> None:
     assert shown.yaw_per_metre
     assert shown.distance_per_metre is None
     assert not shown.distance_better
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", ["skid, five minutes", "differential, five minutes"])
-def test_positions_alone_show_about_the_noise_of_the_heading_that_a_gyro_shows(name: str) -> None:
-    log, stated = SETS[name].log(np.random.default_rng(77002)), []
-    for gyro in (True, False):
-        driven = runs(log, gyro=gyro)
-        shown = noise(driven, fit(driven, Config()), OdometryConfig())
-        assert shown.heading_better
-        assert shown.yaw_per_metre
-        assert shown.yaw_per_radian
-        # The variance after 3 m and 5 rad, most of them to one side.
-        stated.append(
-            3 * shown.yaw_per_metre + 5 * shown.yaw_per_radian + 9 * shown.track + 9 * shown.ratio
-        )
-    print(np.degrees(np.sqrt(stated)))
-    assert 0.3 < stated[1] / stated[0] < 3.0

@@ -5,7 +5,6 @@ from __future__ import annotations
 import errno
 import json
 import os
-import sys
 from pathlib import Path
 
 import pytest
@@ -13,7 +12,6 @@ import pytest
 from acsard.cli import parser
 from acsard.core.config.parsing import parse
 from acsard.host.errors import Exit, MendableError, UnreachableError
-from acsard.terminal import prompt
 from acsard.terminal.output import MAX_TEXT_WIDTH
 from tests.unit.calibration_logs import usual
 
@@ -33,18 +31,6 @@ def called(where: Path, log: str, *words: str, text: str = "# mine\n") -> int:
     ]
     args = parser(["calibrate"]).parse_args([*options, *words])
     return int(args.main(args))
-
-
-def test_a_terminal_shows_what_a_long_fit_does_and_clears_the_line(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setattr(prompt, "has_room", lambda _: True)
-    monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
-    assert called(tmp_path, GOOD) == 0
-    shown = capsys.readouterr().err
-    reads, fits = shown.index("... reading "), shown.index("... fitting 1 run")
-    assert reads < fits
-    assert shown.endswith("\r\033[K")
 
 
 def test_json_is_one_object(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import pytest
 
-from acsard.checkup.board import Board
 from acsard.checkup.findings import StoppedError
 from acsard.checkup.motion import MOTOR_TIMEOUT_S, SPEED, ZERO
 from acsard.checkup.watchdog import run
 from acsard.checkup.wheels import turn
-from acsard.core.config.settings import McuConfig
 from acsard.core.simulator import protocol
 from tests.unit.checkup_robots import Robot
 
@@ -35,22 +33,6 @@ def test_a_motor_that_zeros_do_not_stop_ends_the_check() -> None:
     assert robot.sent[-1].startswith(b"\r\n")  # one line, then silence
     assert not robot.sent[-2].startswith(b"\r\n")
     assert len(robot.sent) == sent
-
-
-def test_a_message_names_the_motors_that_turn_after_the_second_attempt_to_stop() -> None:
-    class Blocked(Robot):
-        """A robot on which a hand stops motor b after 3 s, while motor a turns on."""
-
-        def listen(self, until_ns: int) -> list[tuple[int, bytes]]:
-            super().listen(until_ns)
-            b = "bp03.00" if until_ns < 3e9 else "bp00.00"
-            return [(until_ns, f"ap03.00,{b},cp00.00,dp00.00\r\n".encode())]
-
-    with Board(Blocked("mute"), McuConfig(), 100.0) as board, pytest.raises(StoppedError) as end:
-        board.stop_motors()
-    assert end.value.finding.name == "stop"
-    assert "motor a (front right)" in end.value.finding.text
-    assert "motor b" not in end.value.finding.text
 
 
 def test_silence_ends_the_check_only_during_a_drive() -> None:

@@ -15,7 +15,6 @@ import pytest
 
 from acsard.checkup import inputs
 from acsard.checkup.findings import Finding
-from acsard.checkup.procedure import STEPS
 from acsard.core.config.settings import (
     Config,
     FeedbackConfig,
@@ -27,7 +26,7 @@ from acsard.core.config.settings import (
 )
 from acsard.core.values import NS_PER_S
 from tests.each import each
-from tests.unit.checkup_robots import Checked, Nobody, Person, Robot, check
+from tests.unit.checkup_robots import Checked, Nobody, Person, Robot
 
 WORDS = Path(__file__).with_name("words")
 
@@ -192,12 +191,6 @@ def test_the_check_names_each_fault_and_nothing_else(
         if page not in ("good", "hardware"):
             passed = {finding.name for finding in first if finding.verdict == "PASS"}
     approved(WORDS / f"checkup_{page}.txt", text)
-
-
-def test_every_step_has_a_finding() -> None:
-    checked = check(person=True)
-    names = {"motors" if f.name.startswith("motor ") else f.name for f in checked.findings}
-    assert names == set(STEPS)
 
 
 def test_an_encoder_that_moves_while_no_wheel_turns_fails_its_motor() -> None:

@@ -10,7 +10,7 @@ import pytest
 
 from acsard.checkup import procedure
 from acsard.checkup.board import FINAL_ZEROS
-from acsard.checkup.findings import SKIPPED_STEPS, Finding, WireLostError
+from acsard.checkup.findings import Finding, WireLostError
 from acsard.core.config.settings import Config, SimConfig, WheelMap
 from acsard.core.link.codec import Codec
 from acsard.core.simulator import protocol
@@ -131,35 +131,6 @@ def test_a_check_that_stalled_while_a_motor_turned_turns_no_motor_again(
 
 
 @pytest.mark.parametrize("asleep", [False, True], ids=["stopped", "suspended"])
-@pytest.mark.parametrize("at", ["motor b", "wheel map"])
-def test_after_a_stall_of_the_terminal_the_check_sends_no_line_that_turns_a_motor(
-    at: str, asleep: bool
-) -> None:
-    """The terminal stalls while it shows what the check does next, or a finding."""
-    robot = Stalls(60.0, asleep=asleep)
-
-    class Watches(Person):
-        def doing(self, text: str) -> None:
-            super().doing(text)
-            shows(text)
-
-    def shows(text: str) -> None:
-        if text.startswith(at) and not robot.stalled:
-            robot.stall()
-
-    findings: list[Finding] = []
-
-    def tell(finding: Finding) -> None:
-        findings.append(finding)
-        shows(finding.name)
-
-    procedure.run(robot, Watches(robot), robot.config, tell, lambda: robot.asleep_ns)
-    assert robot.stalled
-    assert robot.turned_after == []
-    assert [finding.name for finding in findings[-2:]] == ["stall", SKIPPED_STEPS]
-
-
-@pytest.mark.parametrize("asleep", [False, True], ids=["stopped", "suspended"])
 @pytest.mark.parametrize(("seconds", "ends"), [(0.6, False), (4.5, False), (60.0, True)])
 def test_before_a_wheel_has_turned_only_a_long_stall_ends_the_check(
     seconds: float, ends: bool, asleep: bool
@@ -218,20 +189,6 @@ def test_a_signal_during_the_last_zeros_does_not_stop_them() -> None:
         procedure.run(robot, Nobody(), robot.config, lambda finding: None)
     assert b"".join(robot.sent[-5:]).count(Codec(WheelMap(), True).stop) == 5
     assert not robot.is_open
-
-
-def test_a_person_who_quits_at_a_question_leaves_a_standing_robot() -> None:
-    robot = Robot("no_watchdog", "comma_latched")
-
-    class Leaves(Nobody):
-        def ask(self, question: str, answers: Sequence[str]) -> str | None:
-            if len(answers) > 1:
-                raise KeyboardInterrupt
-            return answers[0]
-
-    with robot.faulty(), pytest.raises(KeyboardInterrupt):
-        procedure.run(robot, Leaves(), robot.config, lambda finding: None)
-    assert robot.later() == [0.0] * 4
 
 
 @pytest.mark.variations(3)

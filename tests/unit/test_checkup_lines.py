@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import get_args
 
 import pytest
 
@@ -13,12 +12,10 @@ from acsard.checkup import damage, dialect, encoder_counts, line_loss, watchdog
 from acsard.checkup.board import Board
 from acsard.checkup.findings import StoppedError
 from acsard.checkup.motion import SPEED, BoardReply
-from acsard.checkup.outcomes import find
 from acsard.checkup.wheels import turn
 from acsard.core.config.settings import Config, SimConfig, WheelMap
 from acsard.core.link.checked_line import Reading
 from acsard.core.link.codec import Codec, FrameError
-from acsard.core.link.link_diagnosis import ReceivedCode
 from acsard.core.simulator import protocol
 from tests.each import each
 from tests.unit.checkup_robots import Robot
@@ -62,12 +59,6 @@ def test_wrong_counts_of_one_motor_are_found(share: float, words: str) -> None:
         finding = encoder_counts.finding(board, [0, 1])
     assert (finding.verdict, finding.keys) == ("FAIL", {})
     assert words in finding.text
-
-
-def test_more_counts_than_the_host_accepts_are_a_warning() -> None:
-    with Robot().board() as board:
-        board.sampled, board.identity = True, {"counts": "400000"}
-        assert encoder_counts.finding(board, []).verdict == "WARN"
 
 
 def test_counts_that_do_not_change_while_the_wheels_turn_are_to_be_switched_off() -> None:
@@ -242,14 +233,6 @@ def test_the_parser_refuses_every_broken_line(comma: bool, sealed: bool) -> None
             Codec(WheelMap()).decode(line.rstrip())
 
 
-def test_motors_that_do_not_turn_as_commanded_are_left_out() -> None:
-    lines = damage.broken_lines(False, False, [1])
-    assert all(b"ap03" not in line for _, line in lines)
-    assert any(b"bp03" in line for _, line in lines)
-    with Robot().board() as board:
-        assert damage.finding(board, []).verdict == "SKIPPED"
-
-
 def test_rare_reports_by_the_boards_own_clock_are_not_taken_for_answers() -> None:
     for wait_ms in range(0, 400, 50):
         robot = Robot("plain_only")
@@ -257,19 +240,3 @@ def test_rare_reports_by_the_boards_own_clock_are_not_taken_for_answers() -> Non
             board.listen(wait_ms / 1000)
             assert dialect.form(board) is None
             assert not board.comma
-
-
-@pytest.mark.parametrize("period_s", [0.26, 0.74])
-def test_a_reply_period_that_the_configuration_refuses_is_not_advised(period_s: float) -> None:
-    with Robot().board() as board, board.wire.mcu.sparse_replies(period_s):  # type: ignore[attr-defined]
-        board.armed = False
-        rate = dialect.rate(board)
-    assert (rate.verdict, rate.keys) == ("FAIL", {})
-    assert "mcu.reply_period" not in rate.mend
-    assert rate.mend.endswith("at least every 0.25 s")
-
-
-def test_every_diagnosis_of_the_received_bytes_has_an_outcome_of_its_own() -> None:
-    for code in get_args(ReceivedCode):
-        finding = find(f"baud rate: {code}", heard="2 lines", configured=115200)
-        assert finding.verdict == "FAIL", code

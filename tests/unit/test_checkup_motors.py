@@ -63,17 +63,6 @@ def test_a_sudden_runaway_is_found_by_its_third_reply(sampled: bool) -> None:
     assert motion.runaway(replies) is not None
 
 
-@pytest.mark.parametrize("per_turn", [16, 48, 400, 3200])
-def test_a_motor_between_two_counts_turns_and_a_silent_one_stands(per_turn: int) -> None:
-    replies = course(0.6, per_turn, seconds=3.0)
-    first = next(n for n, reply in enumerate(replies) if reply.motors[1])
-    for n in range(first + 1, len(replies)):
-        assert motion.turning(replies[:n], replies[n - 1].at_s) == [1]
-    end_s = replies[-1].at_s
-    assert motion.turning(replies, end_s + motion.MAX_REPLY_AGE_S + 0.01) == []
-    assert motion.turning([], end_s) == []
-
-
 # Motors.
 
 

@@ -8,12 +8,12 @@ import pytest
 
 from acsard.checkup import checkup_report, lateness
 from acsard.checkup.checkup_report import report, summary
-from acsard.checkup.findings import SKIPPED_STEPS, Finding, motor_name, wheel_of
+from acsard.checkup.findings import SKIPPED_STEPS, Finding
 from acsard.checkup.motion import MAX_WATCHDOG_S
 from acsard.checkup.outcomes import OUTCOMES, OUTCOMES_BY_NAME, find
 from acsard.core.config.contradictions import contradictions
 from acsard.core.config.parsing import parse
-from acsard.core.config.settings import Config, McuConfig, WheelMap
+from acsard.core.config.settings import Config
 from acsard.core.link.link_state import WATCHDOG_S
 from tests.each import each
 from tests.unit.checkup_robots import configured
@@ -54,13 +54,6 @@ def test_the_summary_counts_the_verdicts_and_has_the_lines_of_toml() -> None:
     assert summary(result, "acsard.toml") == text
     text = summary(report("sim", [RATE], {}, "", ""), "/srv/robot.toml")
     assert text == "\n1 PASS\n/srv/robot.toml: nothing to change"
-
-
-def test_a_check_that_ended_early_does_not_say_that_nothing_has_to_change() -> None:
-    rest = Finding(SKIPPED_STEPS, "SKIPPED", "9 steps", "the board fell silent")
-    for findings in ([RATE, rest], [Finding("baud rate", "FAIL", "no answer", "look")]):
-        text = summary(report("sim", findings, {}, "", ""), "acsard.toml")
-        assert text.endswith(": no suggestion, because the check did not judge every step")
 
 
 def findings_for(**keys: object) -> list[Finding]:
@@ -139,10 +132,3 @@ def test_the_advised_watchdog_time_is_that_of_the_contract() -> None:
     text = " ".join(part for entry in entries for part in (entry.text, entry.mend))
     times = {f"{1000 * seconds:g}" for seconds in (WATCHDOG_S, MAX_WATCHDOG_S)}
     assert set(re.findall(r"(\d+) ms", text)) == times
-
-
-def test_the_wheel_and_sign_of_a_motor_are_the_configured_ones() -> None:
-    turned = McuConfig(wheels=WheelMap("-c", "+d", "-a", "+b"))
-    wheels = [("rear_left", -1), ("rear_right", 1), ("front_right", -1), ("front_left", 1)]
-    assert [wheel_of(turned, motor) for motor in range(4)] == wheels
-    assert motor_name(turned, 0) == "motor a (rear left)"

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import fcntl
-import io
 import json
 import os
 import pty
@@ -17,15 +16,13 @@ from pathlib import Path
 import pytest
 from msgspec import structs
 
-from acsard.checkup import procedure
 from acsard.cli import mcu, parser
 from acsard.core.config.parsing import parse
 from acsard.core.config.settings import Config
 from acsard.core.simulator.fake_mcu import FakeMcu
 from acsard.core.simulator.virtual_wire import VirtualWire
 from acsard.host.errors import Exit, MendableError, NoPortError, UsageError
-from acsard.terminal.prompt import TerminalPrompt, ended_by_signals
-from tests.unit.checkup_robots import Busy, Robot
+from acsard.terminal.prompt import ended_by_signals
 
 
 def called(where: Path, *words: str, text: str = "") -> int:
@@ -35,20 +32,6 @@ def called(where: Path, *words: str, text: str = "") -> int:
         file.write_text(text)
     args = parser(["mcu"]).parse_args(["mcu", "check", "--config", str(file), *words])
     return int(args.main(args))
-
-
-@pytest.mark.slow
-def test_a_check_that_this_computer_was_too_late_for_has_not_passed(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    def late(config: Config, _: object) -> Busy:
-        return Busy(late_s=0.45, every=3, config=config)
-
-    monkeypatch.setattr(mcu, "_wire", late)
-    assert called(tmp_path, "--port", "sim", "--yes", "--json") == 1
-    report = json.loads(capsys.readouterr().out)
-    assert not report["passed"]
-    assert "FAIL" not in [finding["verdict"] for finding in report["findings"]]
 
 
 @pytest.mark.slow
@@ -106,14 +89,6 @@ def test_findings_are_printed_also_if_the_file_cannot_be_written(
     assert (tmp_path / "acsard.toml").read_text() == ""
 
 
-def test_write_without_tomlkit_says_what_to_install(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setitem(sys.modules, "tomlkit", None)
-    with pytest.raises(MendableError, match=r"pipx? install .*\[(foxglove,)?tools\]'"):
-        called(tmp_path, "--port", "sim", "--yes", "--write")
-
-
 @pytest.mark.slow
 def test_the_port_that_was_named_is_written_with_the_rate_it_has(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
@@ -153,17 +128,6 @@ def test_yes_alone_is_refused_on_what_is_no_simulator(tmp_path: Path) -> None:
             os.close(end_fd)
 
 
-def test_a_person_is_asked_until_the_answer_is_valid(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setattr(sys, "stdin", io.StringIO("yes\n RL \n"))
-    assert TerminalPrompt().ask("which?", ("fr", "rl")) == "rl"
-    out, err = capsys.readouterr()
-    assert out == ""
-    assert "which? [fr/rl/q]" in err
-    assert "please type fr or rl; q quits" in err
-
-
 def on_terminal(columns: int, do: Callable[[], object], monkeypatch: pytest.MonkeyPatch) -> str:
     """Run `do` with a terminal of this width as standard error and return the text it wrote."""
     master, slave = pty.openpty()
@@ -193,30 +157,6 @@ def test_progress_is_one_line_on_a_terminal_that_the_next_one_writes_over(
     assert len(lines) > 8
     assert max(map(len, lines)) < (columns or 80)
     assert written.endswith("\r\033[K"), "what is printed at last stands on a line of its own"
-
-
-@pytest.mark.slow
-def test_progress_does_not_go_into_a_pipe(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    assert called(tmp_path, "--port", "sim", "--yes") == 0
-    TerminalPrompt().doing("a motor turns")
-    out, err = capsys.readouterr()
-    assert err == ""
-    assert "   ..." not in out
-    check = ("--port", "sim", "--yes", "--json")
-    assert on_terminal(80, lambda: called(tmp_path, *check), monkeypatch) == ""
-
-
-def test_the_question_about_lifted_wheels_says_how_to_quit(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setattr(sys, "stdin", io.StringIO("q\n"))
-    robot = Robot()
-    with pytest.raises(KeyboardInterrupt):
-        procedure.run(robot, TerminalPrompt(), robot.config, lambda finding: None)
-    assert "q or Ctrl-C quits" in capsys.readouterr().err
-    assert not any(robot.later())
 
 
 @pytest.mark.parametrize(
