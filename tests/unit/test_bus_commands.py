@@ -152,16 +152,6 @@ def test_a_delete_and_a_wildcard_and_one_byte_too_many_are_refused() -> None:
     assert verdict(text + b" " * (MAX_COMMAND_BYTES - len(text))) == DRIVEN
 
 
-@each("form", FORMATS)
-@each("arm", [0.0, 1e308, *NOT_FINITE])
-def test_the_joints_of_an_arm_beside_the_wheels_do_not_matter(form: Format, arm: float) -> None:
-    if form == "json" and not math.isfinite(arm):
-        return
-    body = joints(*[0.0] * 4, arm, names=[*JOINTS, "arm"], effort=[0.0] * 4 + [arm])
-    found = RECEIVER.command(arrival(written(body, form), "wheel_cmd/app"))
-    assert (found.twist, found.cancelled) == (Twist(), False)
-
-
 def test_wheel_commands_use_the_configured_joint_names() -> None:
     receiver = Receiver(JointsConfig("fr", "fl", "rl", "rr"), KINEMATICS)
     body = joints(*[1.0] * 4, names=["rl", "fr", "rr", "fl"])
@@ -372,13 +362,6 @@ def test_a_damaged_payload_is_a_finite_command_or_refused(
         return
     assert math.isfinite(found.twist.linear)
     assert math.isfinite(found.twist.angular)
-
-
-@each("digits", [19, 40, 400, 4000])
-def test_a_stamp_beyond_any_clock_is_refused(digits: int) -> None:
-    body = '{"header":{"stamp":{"sec":%s}},"twist":{"linear":{},"angular":{}}}' % ("9" * digits)
-    with pytest.raises(DecodeError):
-        RECEIVER.command(arrival(body.encode()))
 
 
 def test_a_stamp_of_the_largest_second_does_not_make_the_arbiter_raise() -> None:

@@ -66,16 +66,6 @@ def test_a_router_that_is_missing_or_connects_is_reported_once() -> None:
     assert counters == {"router_missing": 1}
 
 
-def test_of_two_routers_only_that_which_changed_is_reported() -> None:
-    ((found,), (lost,), both), counters = told(
-        RoutersStatus((A, B)), RoutersStatus((A,), (B,)), RoutersStatus((B,), (A,))
-    )
-    assert found.name == "router_found"
-    assert (B in lost.text, A in lost.text) == (True, False)
-    assert [event.name for event in both] == ["router_missing", "router_found"]
-    assert counters == {"router_missing": 2}
-
-
 def test_a_peer_in_the_place_of_a_router_is_reported_once_with_its_consequence() -> None:
     # At first, the type of this peer is not known yet.
     peer = RoutersStatus((A,), peers=(A,))

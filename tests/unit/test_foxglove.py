@@ -147,28 +147,6 @@ def test_the_configuration_is_read_again_if_the_daemon_restarts_while_it_is_quer
     assert world.offers("xx")
 
 
-class StartingWorld(World):
-    """A world whose daemon restarts during the first query of the bridge."""
-
-    restarted = False
-
-    def _configuration(self, robot: Connection) -> Config:
-        config = super()._configuration(robot)
-        if not self.restarted:
-            self.restarted = True
-            self.restart()
-        return config
-
-
-def test_a_restart_of_the_daemon_while_the_bridge_starts_is_noticed(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    world = StartingWorld(monkeypatch)
-    world.passes(1.0)
-    assert world.offers("x")
-    assert world.queries == 1
-
-
 def test_a_viewer_that_comes_while_the_daemon_is_gone_is_told(world: World) -> None:
     world.daemon(zenoh.SampleKind.DELETE)
     world.passes(1.0)

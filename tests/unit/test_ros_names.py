@@ -15,7 +15,6 @@ from hypothesis import strategies as st
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from acsard.core.config.settings import (
-    CommandsConfig,
     Config,
     LidarConfig,
     McuConfig,
@@ -23,7 +22,6 @@ from acsard.core.config.settings import (
     RosConfig,
 )
 from acsard.core.messages.encodings import DecodeError
-from acsard.core.messages.keys_and_roles import TOPICS
 from acsard.core.ros.attachments import Attachment, unpack
 from acsard.core.ros.channels import ACSARD_PREFIX, DEFINITIONS, schema_text
 from acsard.core.ros.names import (
@@ -38,14 +36,12 @@ from acsard.core.ros.names import (
     rmw_qos,
 )
 from acsard.core.ros.transports import (
-    PARAMETERS_PREFIX,
     Endpoint,
     claims,
     command_keys,
     endpoints,
     left_out,
     node_tokens,
-    ros_names,
 )
 from tests.each import each
 from tests.promised import PROMISED
@@ -291,20 +287,6 @@ def test_two_robots_share_a_claim_if_one_topic_would_drive_both() -> None:
     assert not shared(RosConfig(bridge=False), RosConfig(bridge=False, domain=7))
     assert not shared(RosConfig(bridge=False), RosConfig(rmw=False)), "no commander reaches both"
     assert claims(RosConfig(bridge=False, rmw=False)) == ()
-
-
-def test_every_ros_name_belongs_to_a_row_of_the_topic_table() -> None:
-    patterns = {topic.key.replace("<source>", ""): topic for topic in TOPICS}
-    sources = {source.name for source in CommandsConfig().sources}
-    for row in ros_names():
-        assert row.type in TYPE_HASHES
-        head, _, source = row.native.partition("/")
-        if row.direction == "in" and row.native not in ("imu", "speed_limit"):
-            assert source in sources
-            assert patterns[f"{head}/"].direction == "in"
-        elif not row.native.startswith(PARAMETERS_PREFIX):
-            assert patterns[row.native].direction == row.direction
-            assert patterns[row.native].latched == row.qos.transient
 
 
 def test_every_endpoint_with_a_single_type_has_its_own_token() -> None:

@@ -27,7 +27,6 @@ from acsard.core.config.parsing import (
     parse,
     parse_recorded,
 )
-from acsard.core.config.partial import InvalidKeyError, mistakes, view_without
 from acsard.core.config.settings import (
     BusConfig,
     Config,
@@ -36,16 +35,14 @@ from acsard.core.config.settings import (
     McuConfig,
     Source,
     WebConfig,
-    WheelMap,
 )
 from acsard.core.config.validation import build
-from acsard.core.config.wire_time import highest_rate, line_bytes, wire_ns, wire_use
-from acsard.core.values import WHEELS
+from acsard.core.config.wire_time import highest_rate, wire_ns, wire_use
 from acsard.host.errors import UsageError
 from acsard.web.listen import parse_listen
 from tests.each import each
 from tests.unit.keys import KEYS, Key
-from tests.vectors.lines import SEED_LINE, WIRE
+from tests.vectors.lines import WIRE
 
 PAGE = Path(__file__).parent / "words" / "settings.txt"
 REFERENCE = Path(__file__).parents[2] / "acsard.toml"
@@ -105,17 +102,6 @@ def test_the_defaults_are_those_of_the_original_robot() -> None:
     # The bus is on the loopback only, and not on the port of routers.
     bus = config.bus
     assert (bus.listen, bus.connect, bus.insecure) == (("tcp/127.0.0.1:7448",), (), False)
-
-
-def test_the_wheel_map_and_the_joints_have_the_four_wheels_in_the_standard_order() -> None:
-    assert WheelMap.__struct_fields__ == JointsConfig.__struct_fields__ == WHEELS
-    assert JointsConfig().as_tuple() == tuple(f"{wheel}_wheel_joint" for wheel in WHEELS)
-    assert JointsConfig("fr", "fl", "rl", "rr").as_tuple() == ("fr", "fl", "rl", "rr")
-
-
-def test_every_table_is_frozen() -> None:
-    assert all(key.table.__struct_config__.frozen for key in KEYS)
-    assert Config.__struct_config__.frozen
 
 
 def accepts(key: Key, value: float) -> bool:
@@ -245,16 +231,6 @@ def test_the_effective_configuration_reads_back_as_the_same_configuration() -> N
 # rules between keys
 
 
-def test_rules_are_applied_unless_they_read_an_invalid_key() -> None:
-    view = view_without(Config(), {"mcu.baud_rate", "mcu.link_check", "limits"})
-    assert (view.mcu.port, view.mcu.wheels.front_right) == ("sim", "+a")
-    with pytest.raises(InvalidKeyError):
-        _ = view.limits.linear_speed
-    # `line_bytes` is a property that reads an invalid key.
-    rules = (lambda c: [str(c.mcu.line_bytes)], lambda c: [c.robot.id], lambda c: [c.log.level])
-    assert mistakes(rules, view) == ["acsar", "info"]
-
-
 @each(
     "addresses",
     [
@@ -318,13 +294,6 @@ def test_an_automatic_rate_uses_at_most_80_percent_of_the_wire_for_the_longest_l
         found.append(config.rate_hz)
     assert tuple(found) == rates
     assert Config(control=ControlConfig(rate=50)).rate_hz == 50.0
-
-
-def test_a_plain_command_has_the_length_of_the_seed_line_in_both_dialects() -> None:
-    assert line_bytes(trailing_comma=False) == len(SEED_LINE + b"\r\n") == 33
-    assert line_bytes(trailing_comma=True) == len(SEED_LINE + b",\r\n") == 34
-    # 33 bytes x 10 bits x 100 / 115200
-    assert wire_use(100.0, 115200, 33) == pytest.approx(0.2865, abs=1e-4)
 
 
 # names

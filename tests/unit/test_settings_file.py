@@ -125,16 +125,6 @@ def test_a_huge_file_is_refused_without_being_read_to_its_end(tmp_path: Path, us
         tracemalloc.stop()
 
 
-@pytest.mark.parametrize("use", [*USES][2:])
-def test_a_loop_of_symbolic_links_is_refused_and_kept(tmp_path: Path, use: str) -> None:
-    file = tmp_path / "acsard.toml"
-    file.symlink_to(file)
-    words = r"was not changed: .*Too many levels of symbolic links"
-    with pytest.raises(MendableError, match=words):
-        USES[use](file)
-    assert file.is_symlink()
-
-
 def test_two_changes_at_once_lose_neither(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A slow disk keeps the first change waiting for its sync while the second one begins."""
     file, syncs = tmp_path / "robot.toml", threading.Event()

@@ -163,12 +163,6 @@ def test_a_setting_that_cannot_be_set_is_reported_with_the_remedy(
     assert len(line) < 300
 
 
-def test_only_the_first_of_many_unsettable_keys_is_explained() -> None:
-    first, more = problems({f"limits.no{n}": 1.0 for n in range(100)})
-    assert "limits.no0" in first
-    assert more == "and 99 more of these keys cannot be set"
-
-
 # while it drives
 
 SOFTER = [key for key, row in LIVE.items() if row.when == "raised"]

@@ -151,9 +151,3 @@ def test_the_largest_feedback_speed_must_exceed_the_commanded_speed_by_a_tenth(
     # The limits ask for (1.0 m/s + 4.0 rad/s x 0.15 m) / 0.05 m = 32 rad/s, and a tenth is added.
     messages = problems(Config(feedback=FeedbackConfig(wheel_speed=wheel_speed)))
     assert (messages == []) is good
-
-
-def test_a_smaller_wheel_has_to_turn_faster() -> None:
-    drive = DriveConfig(left_wheel_radius_multiplier=0.5)
-    (line,) = problems(Config(drive=drive, feedback=FeedbackConfig(wheel_speed=43.0)))
-    assert "commands of 40.0 rad/s" in line

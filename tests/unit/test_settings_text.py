@@ -2,23 +2,19 @@
 
 from __future__ import annotations
 
-import math
 import tomllib
 import zlib
 from pathlib import Path
-from typing import Annotated, Literal
 
 import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
-from msgspec import Meta, Struct
-from tomlkit.exceptions import NonExistentKey
 
 from acsard.core.config.parsing import ConfigError, effective, from_builtins, parse
 from acsard.core.config.settings import Config, McuConfig, Source
 from acsard.core.config.toml_editing import edited
 from acsard.core.config.toml_text import document, excerpt
-from acsard.core.config.validation import build, show, write
+from acsard.core.config.validation import show, write
 from tests.each import each
 from tests.unit.keys import KEYS
 
@@ -80,75 +76,6 @@ def test_any_bytes_give_a_configuration_or_a_list_of_problems(data: bytes) -> No
     good = REFERENCE.read_bytes()
     at = zlib.crc32(data) % len(good)
     judged(good[:at] + data[:8] + good[at + len(data) // 2 :])
-
-
-# validation by the types of a table
-
-
-class Leg(Struct, frozen=True):
-    name: Annotated[str, Meta(extra={"example": "left"})]
-    length: Annotated[float, Meta(ge=0.5, le=2.0, extra={"unit": "m"})] = 1.0
-
-
-class Table(Struct, frozen=True):
-    toes: Annotated[int, Meta(ge=3, le=5)] = 4
-    wood: Literal["oak", "ash"] = "oak"
-    heavy: bool = False
-    marks: tuple[str, ...] = ()
-    speed: Annotated[float, Meta(ge=1.0, le=9.0, extra={"unit": "m/s"})] | Literal["auto"] = 2.0
-    first: Leg = Leg("left")
-    legs: tuple[Leg, ...] = ()
-
-
-def problems_of(table: object) -> list[str]:
-    problems: list[str] = []
-    assert build(Table, table, "", problems) is None
-    return problems
-
-
-def test_every_kind_of_value_is_accepted() -> None:
-    table = {
-        "toes": 5, "wood": "ash", "heavy": True, "marks": ["a", "b"], "speed": "auto",
-        "first": {"name": "x", "length": 2}, "legs": [{"name": "y"}, {"name": "z", "length": 0.5}],
-    }  # fmt: skip
-    expected = Table(
-        toes=5, wood="ash", heavy=True, marks=("a", "b"), speed="auto",
-        first=Leg("x", 2.0), legs=(Leg("y"), Leg("z", 0.5)),
-    )  # fmt: skip
-    assert build(Table, table, "", []) == expected
-    assert build(Table, {}, "", []) == Table()
-
-
-@each(
-    ("table", "line"),
-    [
-        ({"toes": 6}, "toes = 6: expected a whole number from 3 to 5; the default is toes = 4"),
-        ({"toes": True}, "toes = true: expected a whole number from 3 to 5; "),
-        ({"heavy": 1}, "heavy = 1: expected true or false; the default is heavy = false"),
-        ({"marks": [1]}, "marks = [1]: expected a list, each a text in quotes; "),
-        ({"speed": 0.5}, 'speed = 0.5: expected a number from 1 to 9 m/s or one of "auto"; '),
-        *(({"speed": bad}, "speed = ") for bad in (math.nan, math.inf, -math.inf)),
-        *(({"first": {"name": "x", "length": bad}}, "first.length = ")
-          for bad in (math.nan, math.inf)),
-        ({"first": 7}, "first = 7: expected a table; write it as [first]"),
-        ({"first": {"name": 3}}, 'first.name = 3: expected a text in quotes; for example "left"'),
-        ({"legs": {"name": "x"}}, 'legs = {name = "x"}: expected tables; write them as [[legs]]'),
-        ({"legs": [{"name": "x"}, {}]}, 'legs[1].name: missing; write name = "left"'),
-        ({"first": {"name": "x", "lenght": 1}}, "first.lenght = 1: unknown key; did you mean leng"),
-        ({"qqq": 4}, "qqq = 4: unknown key; known here: toes, wood, heavy, marks, speed, "),
-    ],
-)  # fmt: skip
-def test_a_mistake_gives_one_line_with_key_value_and_remedy(table: object, line: str) -> None:
-    (problem,) = problems_of(table)
-    assert problem.startswith(line)
-
-
-def test_all_mistakes_are_reported_together() -> None:
-    lines = problems_of({"toes": 9, "wood": "elm", "legs": [{}, {"nam": 1}], "x": 0})
-    starts = {line.partition(":")[0] for line in lines}
-    assert starts == {
-        "x = 0", "toes = 9", 'wood = "elm"', "legs[0].name", "legs[1].nam = 1", "legs[1].name",
-    }  # fmt: skip
 
 
 # what is written
@@ -273,12 +200,3 @@ def test_windows_line_ends_are_kept() -> None:
     assert after.startswith(before)
     assert after.count("\r\n") == after.count("\n") > 8
     assert "\r\r" not in after
-
-
-def test_an_error_of_the_toml_library_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
-    def fails(text: str) -> None:
-        raise NonExistentKey("mcu")
-
-    monkeypatch.setattr("tomlkit.parse", fails)
-    with pytest.raises(ValueError, match="mcu"):
-        edited("# mine\n", EDITS)

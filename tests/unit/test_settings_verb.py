@@ -39,14 +39,6 @@ def test_a_value_is_written_as_in_the_file_and_a_bare_word_is_a_text(
     assert type(settings["log.level"]) is type(value)
 
 
-def test_several_settings_are_a_list_of_key_value_pairs() -> None:
-    assert pairs(["rates.telemetry", "5", "log.level", "info"]) == {
-        "rates.telemetry": 5,
-        "log.level": "info",
-    }
-    assert pairs([]) == {}
-
-
 class Robot:
     """A robot that sets everything."""
 
