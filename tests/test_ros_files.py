@@ -313,9 +313,6 @@ def test_ros2_control_uses_the_robot_s_joint_topics_in_the_right_direction(
         assert resolved(topic, namespace, manager["remappings"]) == f"{prefix}{topic}"
 
 
-# acsar.rviz
-
-
 # zenoh-bridge-ros2dds.json5
 
 

@@ -53,15 +53,3 @@ def arc(pose: Pose, distance: float, turn: float) -> Pose:
     yaw = math.remainder(pose.yaw, math.tau)
     dx, dy, yaw = on_arc(yaw, distance, turn)
     return Pose(pose.x + dx, pose.y + dy, yaw)
-
-
-class Plain:
-    """Odometry that integrates the mean of front and rear wheels and excludes no wheel."""
-
-    def __init__(self) -> None:
-        self._kinematics, self.pose = Kinematics(DriveConfig()), Pose()
-
-    def fold(self, line: Feedback) -> None:
-        turned = WheelSpeeds(*(speed * line.dt for speed in line.speeds.as_tuple()))
-        twist = self._kinematics.twist(turned)
-        self.pose = arc(self.pose, twist.linear, twist.angular)

@@ -22,7 +22,6 @@ from acsard.core.config.named_faults import ARGUMENTS
 from acsard.core.values import Pose
 from acsard.host import errors
 from acsard.host.errors import (
-    Exit,
     MendableError,
     UsageError,
 )

@@ -203,9 +203,6 @@ def test_a_pose_that_is_set_in_a_silence_knows_that_a_part_of_it_came_before(sha
     assert later.pose.x - estimate.pose.x == pytest.approx(0.1 * RADIUS)
 
 
-# a turn that was missed
-
-
 # the twist
 
 

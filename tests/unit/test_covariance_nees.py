@@ -70,9 +70,6 @@ def test_the_covariance_matches_the_pose_errors(scenario: str, model: str) -> No
     check(values, f"{scenario}, {model}", 0.89)
 
 
-# bursts of lost lines
-
-
 # encoders
 
 
@@ -117,6 +114,3 @@ def test_the_encoder_counts_of_a_straight_add_no_yaw_variance(counts: int) -> No
     _, by_counts = fold(counting(counts)(drive, rng), DEFAULT, counts)
     _, exact = fold(plain(drive), DEFAULT)
     assert by_counts[2, 2] == pytest.approx(exact[2, 2], rel=0.05)
-
-
-# the twist

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import random
-
 from msgspec.structs import replace
 
 from acsard.core.config.settings import FeedbackConfig, McuConfig
@@ -191,17 +189,6 @@ def test_the_bad_lines_of_an_update_make_one_event_for_each_reason(reads: int) -
     bench.wait(10, *([b"x\r\n" * 200 + b"ap99.99\r\n" + b"y" * 300 + b"\r\n"] * reads))
     rows = [(event.kind, event.count, event.text) for event in bench.session.events]
     assert rows == [("malformed", 201 * reads, "b'ap99.99'"), ("too_long", reads, "")]
-
-
-@each("restart", [lambda b: (b.close().wait(10), b.open().wait(10)), lambda b: b.wait(10, BOOTED)])
-def test_configured_counts_that_disagreed_are_trusted_again_by_a_new_board(restart: type) -> None:
-    bench, dice = LinkBench(replace(FREE, encoder_counts=20)).up(), random.Random(1)
-    for _ in range(100):
-        line = ",".join(f"{motor}p{dice.uniform(20, 60):05.2f}" for motor in "abcd")
-        bench.wait(10, line.encode() + b"\r\n")
-    assert bench.session.count_recovery.counts(20) == (0,) * 4
-    restart(bench)
-    assert bench.session.count_recovery.counts(20) == (20,) * 4
 
 
 # a board that names itself

@@ -75,15 +75,6 @@ def test_without_configured_counts_no_line_has_whole_counts_and_coarse_lines_are
         assert (recovery.coarse_lines > 1000) == coarse == bool(recovery.coarse_lines)
 
 
-def test_after_forgetting_no_step_is_known() -> None:
-    recovery = CountRecovery()
-    rows = [Feedback(AT, WheelSpeeds(*speeds), PERIOD) for speeds, _ in lines(400)]
-    for line in rows:
-        recovery.recover_counts(line, 0.0)
-    recovery.forget()
-    assert recovery.recover_counts(rows[500], 0.0).steps == (math.inf,) * 4
-
-
 def steps_after(speeds: list[float], steps: Steps | None = None) -> Steps:
     steps = steps or Steps()
     for speed in speeds:
@@ -105,15 +96,6 @@ def test_a_quantization_step_is_known_once_it_has_recurred_and_while_it_does() -
     steps = steps_after([0.0, 30.0] * BLOCK_STEPS)
     assert steps.size == 30.0
     assert steps_after(fine_speeds(3 * BLOCK_STEPS), steps).size < 0.5
-
-
-def test_a_randomly_jumping_wheel_beside_three_fine_ones_is_not_a_coarse_encoder() -> None:
-    dice, recovery = random.Random(1), CountRecovery()
-    for _ in range(1000):
-        fine = [round(5.0 + dice.uniform(-0.1, 0.1), 2) for _ in range(3)]
-        speeds = WheelSpeeds(round(dice.uniform(-70.0, 70.0), 2), *fine)
-        line = recovery.recover_counts(Feedback(AT, speeds, 0.01), 0.0)
-    assert max(line.steps) < 1.0
 
 
 class WholeCounts:
@@ -147,16 +129,6 @@ def test_a_line_that_repeats_the_previous_one_turns_no_wheel() -> None:
     assert counter.turned(speeds, 0.008) == (counter.angle, 0.0, counter.angle, 0.0)
     assert counter.turned(speeds, 0.003) == (0.0, 0.0, 0.0, 0.0)
     assert counter.turned(speeds, 0.005) == (counter.angle, 0.0, counter.angle, 0.0)
-
-
-def test_a_wrong_number_of_counts_is_corrected_by_the_next_line() -> None:
-    counter, total = WholeCounts(96), 0.0
-    for number, time, own in ((3, 0.010, 0.010), (3, 0.0139, 0.0112), (2, 0.0077, 0.0104)):
-        speed = round(number * counter.angle / time, 2)
-        turned = counter.turned((speed, speed, speed, speed), own)
-        assert turned is not None
-        total += turned[0]
-    assert total / counter.angle == pytest.approx(8)
 
 
 def test_whole_counts_are_refuted_for_firmware_that_filters() -> None:

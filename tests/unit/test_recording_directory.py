@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-from contextlib import suppress
 from pathlib import Path
 from typing import NamedTuple
 
@@ -104,29 +103,3 @@ def test_the_oldest_files_go_and_leave_room(
     if files == 60:
         assert "30 recordings deleted (000001-" in text
         assert "only 40.0 MB of the disk were free, and recordings leave 50.0 MB" in text
-
-
-def test_a_file_that_another_process_removes_meanwhile_does_no_harm(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    store = new(tmp_path)
-    first, *_ = [record(store, size=8_000_000) for _ in range(3)]
-    unlink, stat = Path.unlink, Path.stat
-
-    def twice(path: Path, missing_ok: bool = False) -> None:
-        unlink(path)
-        unlink(path)
-
-    def removed(path: Path, *, follow_symlinks: bool = True) -> os.stat_result:
-        if path == first:
-            with suppress(FileNotFoundError):
-                unlink(path)
-        return stat(path, follow_symlinks=follow_symlinks)
-
-    monkeypatch.setattr(Path, "unlink", twice)
-    store.make_room()
-    assert not first.exists()
-    first.touch()
-    monkeypatch.setattr(Path, "stat", removed)
-    store.make_room()
-    assert not os.path.exists(first)

@@ -16,7 +16,6 @@ from tests.each import each
 from tests.scenarios.taped import Tape
 from tests.scenarios.world import START, World
 from tests.system.typed import typed
-from tests.unit.test_checkup_verb import on_terminal
 from tests.unit.test_recording_report import traces
 
 RECORDED = "000007-20270115T080000Z.rec.zst"
@@ -80,9 +79,6 @@ def test_another_configuration_computes_the_odometry_again(where: Path, here: Pa
     assert further == pytest.approx(2 * far, rel=0.02)
 
 
-# calibrate
-
-
 @each("words", ["y.pdf", "y.csv", "y.mcap --csv"])
 def test_a_name_with_the_ending_of_another_kind_is_refused(
     words: str, where: Path, here: Path, capsys: pytest.CaptureFixture[str]
@@ -124,50 +120,9 @@ def test_the_numbers_of_the_file_are_those_of_the_recording(
     assert "(by unnamed (native))" in text
 
 
-def test_a_damaged_place_is_left_out_and_named(tmp_path: Path) -> None:
-    bad, new = tmp_path / "bad.rec.zst", tmp_path / "bad.html"
-    data = bytearray(QUIET.read_bytes())
-    data[len(data) // 2] ^= 0xFF
-    bad.write_bytes(data)
-    code, _, err = report(bad, new)
-    assert code == 0
-    assert "bad.rec.zst: bytes " in err
-    assert re.search(
-        r'<p class="note">bad.rec.zst: bytes .* cannot be read', new.read_text(encoding="utf-8")
-    )
-
-
-SLOW = pytest.mark.slow
-
-
 @pytest.fixture(scope="module")
 def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return a recording of this version, which is long enough to show progress."""
     tape = Tape()
     World(recorder=tape).drive(0.5, 0.3, seconds=8.0)
     return tape.save(tmp_path_factory.mktemp("recorded") / "drive.rec.zst")
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    "verb", ["replay", pytest.param("report", marks=SLOW), pytest.param("export", marks=SLOW)]
-)
-def test_the_progress_is_shown_on_a_terminal(
-    verb: str, recorded: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    words = [
-        "recording",
-        verb,
-        str(recorded),
-        *([] if verb == "replay" else [str(tmp_path / "new")]),
-    ]
-    output = on_terminal(80, lambda: main(words), monkeypatch)
-    assert re.match(r"(\r2027-01-15 \d\d:00:0\d)+", output)
-    assert output.endswith("\r\x1b[K")
-
-
-def test_no_progress_is_written_into_a_pipe(
-    recorded: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert main(["recording", "replay", str(recorded)]) == 0
-    assert capsys.readouterr().err == ""

@@ -12,7 +12,7 @@ import msgspec
 import pytest
 import zstandard
 
-from acsard.core.values import NS_PER_S, Instant, Request
+from acsard.core.values import Instant, Request
 from acsard.host.errors import RecordingError
 from acsard.recording import file as recording_file
 from acsard.recording.file import MAGIC, SUFFIX, FrameWriter, Head, Recording, encode_steps, listed
@@ -100,16 +100,6 @@ def test_damage_costs_the_rest_of_its_frame_and_is_said(tmp_path: Path) -> None:
         assert recording.damage or len(numbers) == len(TAKEN), at
 
 
-def test_a_damaged_length_costs_only_its_frame(tmp_path: Path) -> None:
-    """The second frame seems to have a block that reaches beyond the end of the file."""
-    data = bytearray(write(TAKEN))
-    block = frames_in(bytes(data))[1] + len(MAGIC) + 2
-    data[block : block + 3] = (131_000 << 3 | 2 << 1).to_bytes(3, "little")
-    numbers, recording = read(tmp_path / "a", bytes(data))
-    assert numbers == [n for n in range(len(TAKEN)) if not 2 * SECOND <= n < 4 * SECOND]
-    assert len(recording.damage) == 1
-
-
 def test_a_file_that_is_no_recording_is_refused_in_words(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "pipe")
     for path in (tmp_path / "missing", tmp_path, tmp_path / "pipe"):
@@ -183,17 +173,6 @@ def test_steps_between_two_times_are_found_over_all_files(tmp_path: Path) -> Non
                         if at[0] <= w <= at[1]]  # fmt: skip
             found = [step.number for step in Recording(paths, *at).steps()]
             assert found == expected, (begin, end)
-
-
-def test_a_file_that_ended_before_the_time_is_not_read(tmp_path: Path) -> None:
-    path = tmp_path / "a"
-    path.write_bytes(write(TAKEN))
-    last = TAKEN[-1].now.wall_ns
-    os.utime(path, ns=(last, last))
-    assert list(Recording([path], last + 2 * NS_PER_S).records()) == []
-    # A copy, by another clock.
-    os.utime(path, ns=(0, 0))
-    assert [step.number for step in Recording([path], last, last).steps()] == [len(TAKEN) - 1]
 
 
 def test_the_files_of_a_directory_are_ordered_by_their_numbers(tmp_path: Path) -> None:

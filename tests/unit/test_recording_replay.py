@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from pathlib import Path
 
 import pytest
@@ -11,7 +10,6 @@ from msgspec.structs import replace
 from acsard.core.config.settings import Config
 from acsard.host.errors import RecordingError
 from acsard.recording.file import FrameWriter, Head, Recording
-from acsard.recording.recorded_steps import checksum
 from acsard.recording.replay import Playback
 from acsard.recording.replay_text import describe_difference
 from tests.unit.drives import CONFIG, drive
@@ -54,17 +52,3 @@ def test_a_difference_names_the_side_without_a_pose(tmp_path: Path) -> None:
     assert "pose x 0.000000" in recorded
     assert "no pose" in replayed
     assert "no pose" not in recorded
-
-
-# the estimates are stored rounded, with a checksum of the exact ones
-
-ESTIMATES = [estimate for step in TAPE.taken for estimate in step.news.estimates]
-
-
-def test_a_checksum_continues_and_covers_every_bit() -> None:
-    *early, last = ESTIMATES
-    assert checksum(ESTIMATES[5:], checksum(ESTIMATES[:5], 0)) == checksum(ESTIMATES, 0)
-    nudged = replace(last, pose=replace(last.pose, x=math.nextafter(last.pose.x, 9.0)))
-    turned = replace(last, positions=(0.0, *last.positions[1:]))
-    for other in (nudged, turned):
-        assert checksum([*early, other], 0) != checksum(ESTIMATES, 0)

@@ -22,7 +22,7 @@ from acsard.core.config.settings import Baud, Config, McuConfig, SimConfig
 from acsard.core.simulator import protocol
 from acsard.core.simulator.baud_mismatch import garbled
 from acsard.core.simulator.fake_mcu import MS, RESET_NS, FakeMcu
-from acsard.core.simulator.protocol import Command, latched, plain_only, prefix, reference
+from acsard.core.simulator.protocol import Command, plain_only, prefix, reference
 from acsard.core.simulator.virtual_wire import VirtualWire
 from acsard.daemon.serial.simulator_pty import SimPty
 from acsard.host import clock
@@ -232,13 +232,6 @@ def test_a_plain_or_a_checked_line_is_a_command_and_any_other_is_none(
     assert reference(line) == command
     if b"#" not in line and b"*" not in line:
         assert plain_only(line) == prefix(line) == command
-
-
-def test_the_old_firmwares_obey_a_checked_line_as_a_plain_one() -> None:
-    assert prefix(closed(PLAIN + b"#07S")) == Command(VALUES)
-    assert latched(PLAIN + b",").values == latched(closed(PLAIN + b",#07S")).values == VALUES
-    assert latched(closed(PLAIN + b"#07S")).values == {0: 12.5, 1: -8.75, 2: 15.0}
-    assert plain_only(closed(PLAIN + b"#07")) is None
 
 
 def test_replies_and_the_identity_line_are_written_as_the_firmware_writes_them() -> None:

@@ -8,13 +8,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from acsard.core.config.settings import Config, DriveConfig, OdometryConfig, SimConfig
+from acsard.core.config.settings import DriveConfig, OdometryConfig, SimConfig
 from acsard.core.incoming.commands import Arrival
 from acsard.core.incoming.imu import reading
 from acsard.core.messages.encodings import FORMATS, Format, encode
 from acsard.core.messages.schema import Time, Vector3
-from acsard.core.simulator.fake_mcu import MS, FakeMcu
-from acsard.core.simulator.simulated_robot import OBSERVATION_PERIOD_NS, Observation, WatchedMcu
+from acsard.core.simulator.simulated_robot import Observation
 from acsard.core.simulator.true_messages import true_pose, turn_rate
 from acsard.core.simulator.vehicle import Vehicle
 from acsard.core.values import Pose
@@ -127,36 +126,6 @@ def test_a_push_moves_the_vehicle_whatever_its_motors_do(speed: float) -> None:
 
 
 # what is observed
-
-TRUE = Config(sim=SimConfig(motor_time_constant=0.0, track_multiplier=1.6))
-LINE = b"ap02.00,bn02.00,cn02.00,dp02.00\r\n"
-RATE = 2.0 * 2 * RADIUS / TRACK / 1.6
-"""Turn rate that the line causes, rad/s."""
-
-
-def test_the_robot_is_observed_every_10_ms_for_any_step_size() -> None:
-    for step_ms in (1, 5, 20):
-        seen: list[Observation] = []
-        mcu = WatchedMcu(TRUE, 0, seen.append)
-        assert mcu.next_ns() == OBSERVATION_PERIOD_NS
-        for ms in range(0, 1001, step_ms):
-            if ms >= 100 and ms % 20 == 0:
-                mcu.receive(ms * MS, LINE)
-            mcu.advance(ms * MS)
-        assert [one.at_ns for one in seen] == [(n + 1) * OBSERVATION_PERIOD_NS for n in range(100)]
-        # The true pose of its time, and the true turn rate
-        assert seen[-1].pose.yaw - seen[49].pose.yaw == pytest.approx(RATE * 0.5)
-        assert [one.gyro for one in seen[50:]] == pytest.approx([RATE] * 50)
-        assert sum(one.gyro for one in seen) * 0.01 == pytest.approx(seen[-1].pose.yaw)
-
-
-def test_an_observed_board_answers_the_same_bytes() -> None:
-    watched, alone = WatchedMcu(TRUE, 0, lambda sight: None), FakeMcu(TRUE)
-    for mcu in (watched, alone):
-        mcu.receive(0, LINE)
-    assert watched.next_ns() < OBSERVATION_PERIOD_NS
-    assert watched.advance(100 * MS) == alone.advance(100 * MS) != b""
-
 
 SIGHT = Observation(7, Pose(1.5, -2.0, math.pi / 2), 0.25)
 WALL_NS = 1_700_000_003_250_000_001
