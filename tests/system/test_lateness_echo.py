@@ -45,7 +45,7 @@ class Delay:
 
     def __init__(self, endpoint: str) -> None:
         self.seconds = 0.0
-        """So long each byte waits."""
+        """How long each byte waits."""
         self.open = threading.Event()
         """Clear in a partition: then all bytes wait until it heals."""
         self.open.set()
