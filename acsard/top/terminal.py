@@ -18,7 +18,6 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
-from functools import partial
 
 from rich.console import Console, Group, RenderableType
 from rich.live import Live
@@ -26,7 +25,7 @@ from rich.text import Text
 
 from acsard.core.values import AcsardError
 from acsard.host import clock
-from acsard.host.logs import CLOSE_TIMEOUT_S, Writer
+from acsard.host.logs import Writer
 from acsard.host.terminal_modes import single_key_mode
 from acsard.terminal.output import MAX_TEXT_WIDTH, plain, show
 from acsard.top import drive_screen
@@ -44,7 +43,10 @@ TABLES_PERIOD_S = 0.5
 # Longest wait for a key before `acsard drive` does its other work.
 KEY_POLL_S = 0.05
 
-SCREEN_END_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT)
+# Also Ctrl-Z (SIGTSTP), because a suspended program neither stops the robot nor leaves the screen.
+SCREEN_END_SIGNALS = (
+    signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT, signal.SIGTSTP,
+)  # fmt: skip
 
 
 def one_screen(feed: Feed) -> str:
@@ -66,12 +68,19 @@ def show_live(feed: Feed) -> None:
         feed.poll()
         return screen(feed.screen_data("q quits"), width)
 
-    _run_suspendable(partial(_watch, draw))
+    _watch(draw)
 
 
 def drive(ride: KeyboardDrive) -> None:
     """Drive the robot with the typed keys, until the input ends or a signal arrives."""
-    _run_suspendable(partial(_steer, ride))
+    _be_lenient()
+    with until_signal(), keys() as read, _screen() as display:
+        due = 0.0
+        while (typed := read(KEY_POLL_S)) is not None:
+            ride.step(typed)
+            if (typed or time.monotonic() >= due) and _terminal_reads():
+                due = time.monotonic() + DRAW_PERIOD_S
+                display.update(drive_screen.screen(ride.screen_data()), refresh=True)
 
 
 def print_last_report(ride: KeyboardDrive) -> None:
@@ -99,18 +108,18 @@ def roster(fleet: Roster) -> None:
         last = Text(below.rstrip(), "dim", no_wrap=bool(rows), overflow="ellipsis")
         return Group(table(rows, width, max(1, height - 4)), Text(), last)
 
-    _run_suspendable(partial(_watch, draw))
+    _watch(draw)
 
 
-def _watch(draw: Callable[[int, int], RenderableType], suspend: list[bool]) -> bool:
-    with keys() as read, _screen() as display:
-        while not suspend:
+def _watch(draw: Callable[[int, int], RenderableType]) -> None:
+    _be_lenient()
+    with until_signal(), keys() as read, _screen() as display:
+        while True:
             if _terminal_reads():
                 display.update(draw(*display.console.size), refresh=True)
             typed = read(TABLES_PERIOD_S)
             if typed is None or "q" in typed.lower():
-                return False
-    return True
+                return
 
 
 def _terminal_reads() -> bool:
@@ -125,36 +134,6 @@ def _screen() -> Live:
         redirect_stdout=False,
         redirect_stderr=False,
     )
-
-
-def _run_suspendable(shows: Callable[[list[bool]], bool]) -> None:
-    _be_lenient()
-    suspend: list[bool] = []
-    signal.signal(signal.SIGTSTP, lambda *_: suspend.append(True))
-    with until_signal():
-        while shows(suspend):
-            suspend.clear()
-            end = time.monotonic() + CLOSE_TIMEOUT_S
-            while not _terminal_reads() and time.monotonic() < end:
-                time.sleep(0.01)
-            os.kill(os.getpid(), signal.SIGSTOP)  # suspend as ^Z does; fg resumes here
-
-
-def _steer(ride: KeyboardDrive, suspend: list[bool]) -> bool:
-    with keys() as read, _screen() as display:
-        due = 0.0
-        while not suspend:
-            typed = read(KEY_POLL_S)
-            if typed is None:
-                return False
-            ride.step(typed)
-            if (typed or time.monotonic() >= due) and _terminal_reads():
-                due = time.monotonic() + DRAW_PERIOD_S
-                display.update(drive_screen.screen(ride.screen_data()), refresh=True)
-    for letter in ("k", "", ""):
-        ride.step(letter)  # stop the robot, because a suspended program sends no commands
-    ride.end()
-    return True
 
 
 def _be_lenient() -> None:

@@ -73,25 +73,20 @@ def test_drive_shows_reason_pose_and_help_on_a_screen_of_any_width(
 
 
 @pytest.mark.slow
-def test_a_drive_that_is_suspended_stops_gives_the_terminal_back_and_goes_on(
+def test_ctrl_z_ends_a_drive_by_a_zero_with_the_terminal_as_it_was(
     shared: Daemon, bus: Bus
 ) -> None:
     with Terminal() as fresh:
         usual = fresh.settings
     with driving(shared) as (terminal, program), bus.follow("cmd/teleop") as commands:
-        during = terminal.settings
-        assert during != usual
         with key_held(terminal, "i"):
             until(lambda: (bus.state()["linear"] or 0.0) > 0.1, 5.0, "moving")
-        suspended = time.monotonic()
-        program.signal(signal.SIGTSTP)
-        until(lambda: terminal.settings == usual, 5.0, "the terminal as it was")
-        commands.find(lambda value: value["linear"]["x"] == 0, 2.0, "a zero", after=suspended)
-        bus.at_rest()
-        program.signal(signal.SIGCONT)
-        until(lambda: terminal.settings == during, 5.0, "the screen again")
-        terminal.press("\x03")
+        typed = time.monotonic()
+        terminal.press("\x1a")
+        commands.find(lambda value: value["linear"]["x"] == 0, 2.0, "a zero", after=typed)
         assert program.ended(3.0) == 0
+        assert terminal.settings == usual
+    bus.at_rest()
 
 
 @pytest.mark.slow
