@@ -12,7 +12,7 @@ import asyncio
 from collections.abc import Iterable, MutableMapping
 from pathlib import Path
 
-from acsard.bus.tls import expiry_times, peer_ends_ns, unusable
+from acsard.bus.tls_files import expiry_times, peer_ends_ns, unusable
 from acsard.bus.zenoh_sessions import certificate_trouble
 from acsard.core.config.settings import BusConfig
 from acsard.core.values import NS_PER_S, WallNs

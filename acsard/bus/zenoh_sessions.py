@@ -14,15 +14,8 @@ from pathlib import Path
 
 import zenoh
 
-from acsard.bus.tls import (
-    CA,
-    CERTIFICATE,
-    KEY,
-    RENEW_ADVICE,
-    files_in,
-    require_usable,
-    trouble,
-)
+from acsard.bus.tls_files import CA, CERTIFICATE, KEY, files_in, require_usable
+from acsard.bus.tls_trouble import RENEW_ADVICE, trouble
 from acsard.core.config.settings import TLS_PREFIX, Config, is_tls
 from acsard.core.messages.keys_and_roles import IMU, SPEED_LIMIT, full_key, source_keys
 from acsard.host.errors import (
@@ -48,7 +41,7 @@ def daemon_session(config: Config) -> zenoh.Session:
     It blocks in client mode until the router answers. Raises `InUseError` if it cannot listen,
     `CertificateError` if Zenoh refuses the files for a TLS router, and `MendableError`.
     """
-    from acsard.bus.access import access_control
+    from acsard.bus.access_rules import access_control
 
     bus = config.bus
     settings = _base(bus.mode) | {
@@ -85,7 +78,7 @@ def gateway_session(config: Config) -> zenoh.Session:
 
     Raises `CertificateError` if Zenoh refuses the files, and `InUseError` if it cannot listen.
     """
-    from acsard.bus.access import gateway_access
+    from acsard.bus.access_rules import gateway_access
 
     bus = config.bus
     settings = _base("router") | RETRY_SETTINGS | _tls(bus.tls) | _listening()

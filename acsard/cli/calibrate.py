@@ -21,7 +21,7 @@ from acsard.calibration.log import Log, LogError, read_file, with_distance
 from acsard.calibration.plan import METHODS
 from acsard.calibration.result import Refusal, calibrate, text
 from acsard.cli.common import add_config, add_outcome, load
-from acsard.cli.connection import add_bus, require_one
+from acsard.cli.robot_options import add_bus, require_one
 from acsard.client.connection import open_connection
 from acsard.core.config.settings import Config
 from acsard.core.formatting import many

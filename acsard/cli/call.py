@@ -10,8 +10,8 @@ import sys
 from collections.abc import Sequence
 
 from acsard.bus import robot_discovery
-from acsard.cli.connection import SEVERAL_IDS, add_bus, connected_to_many, several_ids
 from acsard.cli.replies import of_each, print_each
+from acsard.cli.robot_options import SEVERAL_IDS, add_bus, connected_to_many, several_ids
 from acsard.client.connection import Connection
 from acsard.core.formatting import json_line, lines, printable
 from acsard.core.messages.encodings import encode

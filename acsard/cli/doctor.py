@@ -15,10 +15,10 @@ from rich.text import Text
 
 from acsard.bus.address import address_of
 from acsard.cli.common import add_port, overrides
-from acsard.cli.connection import add_bus, require_one
+from acsard.cli.robot_options import add_bus, require_one
 from acsard.core.formatting import json_line, lines, printable
 from acsard.host.config_file import find
-from acsard.machine.doctor import examine
+from acsard.machine.examination import examine
 from acsard.terminal.output import show_whole
 
 LEVEL_MARKS = {"ok": ("ok  ", "green"), "warning": ("warn", "yellow"), "failure": ("FAIL", "red")}

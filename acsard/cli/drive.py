@@ -6,7 +6,7 @@ import argparse
 import sys
 
 from acsard.cli.common import add_speeds
-from acsard.cli.connection import add_bus, connected, require_one
+from acsard.cli.robot_options import add_bus, connected, require_one
 from acsard.core.messages.permissions import COMMAND_ROLE, has
 from acsard.host.errors import NoAnswerError, NotPermittedError, UsageError
 from acsard.host.logs import MAX_LAST_OUTPUT_S, output_in_threads

@@ -22,7 +22,8 @@ import zenoh
 from acsard.bus.robot_discovery import ALL_ROBOTS, follow, robot_of, running_robots
 from acsard.bus.subscription import encoded
 from acsard.cli.common import between, whole
-from acsard.cli.connection import (
+from acsard.cli.replies import json_line, of_robot
+from acsard.cli.robot_options import (
     SEVERAL_IDS,
     Silence,
     add_bus,
@@ -31,7 +32,6 @@ from acsard.cli.connection import (
     require_readable,
     several_ids,
 )
-from acsard.cli.replies import json_line, of_robot
 from acsard.client.connection import Connection
 from acsard.core import formatting
 from acsard.core.messages.encodings import DecodeError, Decoder

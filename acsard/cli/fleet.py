@@ -19,7 +19,7 @@ import sys
 import msgspec
 
 from acsard.bus.robot_discovery import ALL_ROBOTS
-from acsard.cli.connection import SEVERAL_IDS, add_bus, connected_to_many
+from acsard.cli.robot_options import SEVERAL_IDS, add_bus, connected_to_many
 from acsard.core.formatting import json_line
 from acsard.host.errors import Exit, UnreachableError
 from acsard.host.logs import MAX_LAST_OUTPUT_S, output_in_threads

@@ -10,7 +10,7 @@ import ipaddress
 import signal
 import sys
 
-from acsard.cli.connection import add_bus, connected
+from acsard.cli.robot_options import add_bus, connected
 from acsard.core.formatting import lines
 from acsard.host.child import end_signals
 from acsard.host.errors import Exit, UsageError

@@ -11,8 +11,8 @@ import sys
 
 import msgspec
 
-from acsard.cli.connection import SEVERAL_IDS, add_bus, connected_to_many, require_readable
 from acsard.cli.replies import json_line, of_robot, present_ids
+from acsard.cli.robot_options import SEVERAL_IDS, add_bus, connected_to_many, require_readable
 from acsard.core import formatting
 from acsard.core.formatting import printable
 from acsard.core.values import AcsardError

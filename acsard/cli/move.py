@@ -9,7 +9,7 @@ import argparse
 import sys
 
 from acsard.cli.common import add_speeds, between
-from acsard.cli.connection import add_bus, connected
+from acsard.cli.robot_options import add_bus, connected
 from acsard.client import Client
 from acsard.core.messages.short_texts import place
 from acsard.core.messages.state_warnings import WARNING, warnings

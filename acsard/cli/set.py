@@ -18,8 +18,8 @@ from collections.abc import Sequence
 import msgspec
 from msgspec.structs import replace
 
-from acsard.cli.connection import SEVERAL_IDS, add_bus, connected_to_many, several_ids
 from acsard.cli.replies import of_each, print_each
+from acsard.cli.robot_options import SEVERAL_IDS, add_bus, connected_to_many, several_ids
 from acsard.client.connection import Connection
 from acsard.core.config.live import find_live_setting, flat
 from acsard.core.config.validation import finite, show

@@ -14,7 +14,7 @@ from contextlib import suppress
 from pathlib import Path
 
 from acsard.bus.address import require_id
-from acsard.bus.tls import CA, CERTIFICATE, KEY
+from acsard.bus.tls_files import CA, CERTIFICATE, KEY
 from acsard.cli.common import add_config, load, whole
 from acsard.core.config.settings import Config
 from acsard.core.config.validation import write

@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import argparse
 
-from acsard.cli.connection import add_bus, connected
+from acsard.cli.robot_options import add_bus, connected
 from acsard.host.logs import MAX_LAST_OUTPUT_S, output_in_threads
 from acsard.terminal.output import has_screen
 from acsard.top import terminal

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 from acsard.bus.address import address_of
 from acsard.bus.zenoh_sessions import log_from_environment
 from acsard.cli.common import load, whole, with_record_directory
-from acsard.cli.connection import add_bus
+from acsard.cli.robot_options import add_bus
 from acsard.core.config.settings import Config
 from acsard.core.formatting import lasting
 from acsard.core.values import ROLES
@@ -134,7 +134,7 @@ def places(
 
 def main(args: argparse.Namespace) -> int:
     _, config = _loaded(args)
-    from acsard.web import server, tokens
+    from acsard.web import page_server, tokens
     from acsard.web.manual import MANUAL
 
     def announce(addresses: Sequence[Listen]) -> None:
@@ -145,7 +145,7 @@ def main(args: argparse.Namespace) -> int:
     tls = args.tls or config.bus.tls
     listen = _listen(args, config)
     log_from_environment()
-    options = server.ServerOptions(
+    options = page_server.ServerOptions(
         config,
         address_of(config, args.connect, args.id, args.tls),
         listen,
@@ -157,7 +157,7 @@ def main(args: argparse.Namespace) -> int:
     try:
         # A stopped terminal must not stop the page.
         with output_in_threads():
-            asyncio.run(server.serve(options, announce, log))
+            asyncio.run(page_server.serve(options, announce, log))
     finally:
         log.close()
     return Exit.OK

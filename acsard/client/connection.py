@@ -24,7 +24,7 @@ from msgspec.structs import replace
 from acsard.bus.address import Address
 from acsard.bus.robot_discovery import NO_BATTERY, explain_silence, presence
 from acsard.bus.subscription import Subscription, encoded, queue_on
-from acsard.bus.tls import shown_at
+from acsard.bus.tls_files import shown_at
 from acsard.bus.zenoh_sessions import client_session
 from acsard.client.driving import UnheardError, repeat_zeros
 from acsard.client.identity import ClientIdentity, identity

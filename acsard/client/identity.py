@@ -15,7 +15,7 @@ from typing import Literal
 import zenoh
 from msgspec import Struct
 
-from acsard.bus.tls import common_name
+from acsard.bus.tls_files import common_name
 from acsard.core.messages.keys_and_roles import full_key, whoami_key
 from acsard.core.messages.permissions import ROLE_TEXTS, has, least_role
 from acsard.core.values import NS_PER_S, ROLES, Role

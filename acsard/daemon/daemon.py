@@ -19,7 +19,7 @@ from secrets import randbits
 from typing import Any, Self
 
 from acsard.bus.certificate_watch import watch_certificates
-from acsard.bus.tls import expiry_times, require_usable
+from acsard.bus.tls_files import expiry_times, require_usable
 from acsard.bus.zenoh_sessions import log_from_environment
 from acsard.core.config.settings import Config
 from acsard.core.incoming.queries import offered_services

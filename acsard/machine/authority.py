@@ -19,7 +19,7 @@ from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
-from acsard.bus.tls import CA, CERTIFICATE, KEY
+from acsard.bus.tls_files import CA, CERTIFICATE, KEY
 from acsard.host.atomic_file import replace
 from acsard.host.errors import MendableError
 from acsard.machine.certificates import CA_KEY

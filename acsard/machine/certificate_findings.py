@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from acsard.bus.certificate_watch import router_expiry_times
-from acsard.bus.tls import (
+from acsard.bus.tls_files import (
     AUTHORITY,
     CA,
     CERTIFICATE,

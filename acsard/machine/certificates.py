@@ -16,7 +16,7 @@ from getpass import getpass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from acsard.bus.tls import CA, CERTIFICATE, KEY
+from acsard.bus.tls_files import CA, CERTIFICATE, KEY
 from acsard.core.config.settings import Config, is_tls
 from acsard.core.values import ROLES
 from acsard.host.errors import MendableError, NotPermittedError, UsageError

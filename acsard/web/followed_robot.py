@@ -21,7 +21,7 @@ import zenoh
 from msgspec import Struct
 
 from acsard.bus.address import Address
-from acsard.bus.tls import shown_at
+from acsard.bus.tls_files import shown_at
 from acsard.client.connection import Connection
 from acsard.client.follower import Watch, restarted
 from acsard.core.config.settings import RatesConfig

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 
 from msgspec import Struct
 
-from acsard.bus.tls import names_in, require_usable
+from acsard.bus.tls_files import names_in, require_usable
 from acsard.host.errors import CertificateError, InUseError, UsageError
 from acsard.host.own_identity import own_addresses
 from acsard.web.callers import is_loopback

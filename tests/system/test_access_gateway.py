@@ -15,7 +15,7 @@ import pytest
 from msgspec.structs import replace
 
 from acsard.bus.certificate_watch import FILES_CHECK_PERIOD_NS
-from acsard.bus.tls import KEY, peer_ends_ns
+from acsard.bus.tls_files import KEY, peer_ends_ns
 from acsard.core.config.settings import BusConfig, Config
 from acsard.core.values import NS_PER_S
 from acsard.daemon.gateway.tls_gateway import Gateway

@@ -16,7 +16,7 @@ import zenoh
 from cryptography.hazmat.primitives.asymmetric import ec
 from msgspec.structs import replace
 
-from acsard.bus.tls import trouble
+from acsard.bus.tls_trouble import trouble
 from acsard.bus.zenoh_sessions import client_session, daemon_session
 from acsard.core.config.settings import BusConfig, Config
 from acsard.host.errors import CertificateError, MendableError, UnreachableError
@@ -116,13 +116,13 @@ def test_the_certificate_directory_is_checked_before_the_network(tmp_path: Path)
         ("robot ended", "client", "of 127.0.0.1 has expired, according to this machine's clock"),
         ("robot later", "client", "is not valid yet, according to this machine's clock"),
         ("robot elsewhere", "client", "tls renew --address 127.0.0.1"),
-        ("robot barred", "client", "may not sign for the names in the certificate of 127.0.0.1"),
+        ("robot barred", "client", "the certificate of 127.0.0.1 is not valid"),
         # An authority that has expired does not hide what is wrong with the robot's certificate.
         ("old robot elsewhere", "old client", "tls renew --address 127.0.0.1"),
         ("old robot ended", "old client", "the certificate of 127.0.0.1 has expired"),
         ("old robot later", "old client", "the certificate of 127.0.0.1 is not valid yet"),
         ("robot", "stranger", "did not sign the certificate of"),
-        ("robot", "mixed", "the robot's authority did not sign this"),
+        ("robot", "mixed", "authority did not sign it"),
         ("robot", "ended", "has expired or is not valid yet"),
     ],
 )

@@ -14,11 +14,11 @@ import aiohttp
 import pytest
 import websockets
 
-from acsard.bus.tls import peer_ends_ns
+from acsard.bus.tls_files import peer_ends_ns
 from acsard.core.values import ROLES, Role
 from acsard.machine.authority import Authority
 from acsard.web.connections import MAX_OF_TOKEN
-from acsard.web.server import TICK_S
+from acsard.web.page_server import TICK_S
 from tests.system.browser import NAME, Page, hands
 from tests.system.bystander import lost
 from tests.system.harness import PATIENCE_S, Bus, until

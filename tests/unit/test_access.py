@@ -16,7 +16,7 @@ import zenoh
 from hypothesis import given
 from hypothesis import strategies as st
 
-from acsard.bus.access import access_control, gateway_access
+from acsard.bus.access_rules import access_control, gateway_access
 from acsard.core.config.settings import (
     AccessConfig,
     CommandsConfig,

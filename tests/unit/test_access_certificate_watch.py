@@ -14,7 +14,7 @@ from acsard.bus.certificate_watch import (
     CertificateFiles,
     watch_certificates,
 )
-from acsard.bus.tls import expiry_times, files_in
+from acsard.bus.tls_files import expiry_times, files_in
 from acsard.core.config.settings import BusConfig
 from acsard.host import clock
 from acsard.machine.authority import Authority

@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 import zenoh
 
-from acsard.bus.access import gateway_access
+from acsard.bus.access_rules import gateway_access
 from acsard.cli.router import open_router
 from acsard.core.config.settings import (
     Config,

@@ -14,9 +14,9 @@ from typing import Any
 import pytest
 from msgspec.structs import replace
 
-from acsard.cli import connection, foxglove, main, move, parser
-from acsard.cli.connection import Silence
+from acsard.cli import foxglove, main, move, parser, robot_options
 from acsard.cli.move import _parsed
+from acsard.cli.robot_options import Silence
 from acsard.client.follower import FIRST_STATE_TIMEOUT_S
 from acsard.core.config.named_faults import ARGUMENTS
 from acsard.core.values import Pose
@@ -97,7 +97,7 @@ def test_an_option_may_stand_between_two_arguments(between: str, behind: str) ->
 
 # Each takes 1 to 20 ms of processor time to load.
 SLOW = {
-    "acsard.bus.access", "acsard.core.incoming.queries", "acsard.core.messages.json_schema",
+    "acsard.bus.access_rules", "acsard.core.incoming.queries", "acsard.core.messages.json_schema",
     "asyncio", "concurrent.futures", "cryptography", "difflib", "hashlib", "logging", "numpy",
     "rich", "socket", "ssl", "structlog", "subprocess", "tempfile", "tomllib",
 }  # fmt: skip
@@ -115,8 +115,8 @@ def test_call_loads_no_slow_library() -> None:
 def _reasons(monkeypatch: pytest.MonkeyPatch) -> dict[str, str]:
     """Return the reasons that a look finds for a first and for a later silence."""
     reasons = {"first": "waiting for\x1b[2J acsard/ghost/state", "later": "the way to it is cut"}
-    monkeypatch.setattr(connection, "_none_yet", lambda *_: reasons["first"])
-    monkeypatch.setattr(connection, "_ceased", lambda _: reasons["later"])
+    monkeypatch.setattr(robot_options, "_none_yet", lambda *_: reasons["first"])
+    monkeypatch.setattr(robot_options, "_ceased", lambda _: reasons["later"])
     return reasons
 
 

@@ -14,14 +14,14 @@ import pytest
 from acsard.cli import parser, run
 from acsard.cli.check import main
 from acsard.cli.common import load, overrides, with_record_directory
-from acsard.cli.connection import require_readable, robot_address
+from acsard.cli.robot_options import require_readable, robot_address
 from acsard.core.config.parsing import parse
 from acsard.core.config.settings import Config, McuConfig, WebConfig
 from acsard.host import config_file
 from acsard.host.config_file import SEARCH_PATHS, find
 from acsard.host.errors import Exit, MendableError, UsageError
 from acsard.host.version import version
-from acsard.machine.doctor import OPTION_KEYS
+from acsard.machine.examination import OPTION_KEYS
 
 DEFAULTS = "built-in defaults"
 

@@ -20,8 +20,8 @@ from acsard.core.messages.schema import DiagnosticStatus, Info, KeyValue
 from acsard.host import real_time
 from acsard.host.errors import CertificateError, NoAnswerError
 from acsard.host.kernel_counters import Kernel
-from acsard.machine import doctor, versions
-from acsard.machine.doctor import Running, clocks, compared, examine, reported
+from acsard.machine import examination, versions
+from acsard.machine.examination import Running, clocks, compared, examine, reported
 from acsard.machine.finding import Finding
 from acsard.machine.local_findings import scheduling, serial_port, slowness, unused_version
 from acsard.machine.serial_ports import BOARDS
@@ -103,9 +103,9 @@ def test_a_failed_query_of_the_daemon_has_advice_that_fits_its_error(
     def fail(*_: object) -> None:
         raise error
 
-    monkeypatch.setattr(doctor, "answers", lambda _: True)
-    monkeypatch.setattr(doctor, "query", fail)
-    finding = doctor.query_or_finding(FILE, Address("tcp/127.0.0.1:7448", "acsar", ""))
+    monkeypatch.setattr(examination, "answers", lambda _: True)
+    monkeypatch.setattr(examination, "query", fail)
+    finding = examination.query_or_finding(FILE, Address("tcp/127.0.0.1:7448", "acsar", ""))
     assert isinstance(finding, Finding)
     assert (finding.level, finding.text) == ("failure", str(error))
     assert finding.mend.endswith(mend) if mend else not finding.mend

@@ -14,7 +14,7 @@ import pytest
 from cryptography.hazmat.primitives.asymmetric import ec
 
 from acsard.bus import certificate_watch
-from acsard.bus.tls import expiry_times, require_usable
+from acsard.bus.tls_files import expiry_times, require_usable
 from acsard.cli import main
 from acsard.core.config.settings import BusConfig, Config
 from acsard.core.values import NS_PER_S

@@ -14,14 +14,14 @@ from typing import Any
 import pytest
 
 from acsard.bus import certificate_watch
-from acsard.bus.tls import KEY
+from acsard.bus.tls_files import KEY
 from acsard.cli import parser, web
 from acsard.core.config.settings import LogConfig
 from acsard.host.errors import CertificateError, InUseError, UsageError
 from acsard.host.logs import Log
 from acsard.host.own_identity import own_addresses
 from acsard.machine.authority import Authority
-from acsard.web import server
+from acsard.web import page_server
 from acsard.web.listen import (
     Listen,
     invitations,
@@ -31,7 +31,7 @@ from acsard.web.listen import (
     require_certificate,
 )
 from acsard.web.metrics import Counts
-from acsard.web.server import Certificate
+from acsard.web.page_server import Certificate
 from acsard.web.tokens import ReadTokens, Vault
 
 OWN = [*own_addresses(), "203.0.113.9", "2001:db8::9"]
@@ -145,7 +145,7 @@ def test_an_invitation_is_refused_if_the_server_could_not_start(
 async def test_one_thread_waits_for_a_hanging_disk_and_then_everything_is_read_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(server, "TICK_S", 0.01)
+    monkeypatch.setattr(page_server, "TICK_S", 0.01)
     monkeypatch.setattr(certificate_watch, "FILES_CHECK_PERIOD_NS", 0)
     authority, key = Authority.make(tmp_path, "test", 10), tmp_path / KEY
     authority.issue(tmp_path, "robot", ["192.168.0.1"], 10)
@@ -153,7 +153,7 @@ async def test_one_thread_waits_for_a_hanging_disk_and_then_everything_is_read_a
     text, _ = vault.invite("viewer", "tv", 1)
     tokens, certificate = ReadTokens(vault), Certificate(str(tmp_path), log)
     before = certificate.context
-    reading = asyncio.create_task(server._read_disk(tokens, certificate))
+    reading = asyncio.create_task(page_server._read_disk(tokens, certificate))
     try:
         await tokens.next_reading()
         assert tokens.owner([text]) is not None
@@ -185,7 +185,7 @@ async def test_the_connections_of_a_revoked_token_end_with_the_reading_that_miss
     text, _ = vault.invite("viewer", "tv", 1)
     tokens, valid = ReadTokens(vault), list[bool]()
     page: Any = SimpleNamespace(tidy=lambda: valid.append(tokens.owner([text]) is not None))
-    ticking = asyncio.create_task(server._tick(page, tokens, Counts(), log))
+    ticking = asyncio.create_task(page_server._tick(page, tokens, Counts(), log))
     try:
         await asyncio.sleep(0)
         for revokes in (False, True):

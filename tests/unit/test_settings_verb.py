@@ -62,7 +62,7 @@ class Robot:
 def test_the_answer_says_how_long_the_setting_lasts(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr("acsard.cli.connection.open_connection", lambda *words, **more: Robot())
+    monkeypatch.setattr("acsard.cli.robot_options.open_connection", lambda *words, **more: Robot())
     assert main(["set", "rates.telemetry", "5"]) == 0
     text = "rates.telemetry = 5.0 (was 10.0); a set lasts until the daemon's next start\n"
     assert capsys.readouterr().out == text
@@ -73,7 +73,7 @@ def test_keep_writes_the_file_of_the_robot_on_which_it_is_typed(
 ) -> None:
     file = tmp_path / "robot.toml"
     file.write_text("# mine\n")
-    monkeypatch.setattr("acsard.cli.connection.open_connection", lambda *words, **more: Robot())
+    monkeypatch.setattr("acsard.cli.robot_options.open_connection", lambda *words, **more: Robot())
     monkeypatch.setattr("acsard.cli.set.is_daemon_here", lambda pid: True)
     assert main(["set", "rates.telemetry", "5", "--keep", "--config", str(file)]) == 0
     assert capsys.readouterr().out == f"rates.telemetry = 5.0 (was 10.0); written to {file}\n"
@@ -102,7 +102,7 @@ def test_keep_says_that_the_daemon_uses_another_file(
     variable = "ACSARD_CONFIG=acsard.toml" if started == "ACSARD_CONFIG" else ""
     (process / "environ").write_text(f"HOME=/\0{variable}\0")
     monkeypatch.setattr("acsard.host.processes.PROC", where)
-    monkeypatch.setattr("acsard.cli.connection.open_connection", lambda *words, **more: Robot())
+    monkeypatch.setattr("acsard.cli.robot_options.open_connection", lambda *words, **more: Robot())
     file = used if same else other
     assert main(["set", "rates.telemetry", "5", "--keep", "--config", str(file)]) == 0
     advice = f", but the daemon uses {used}: start it with `--config {other}`\n"
@@ -119,7 +119,7 @@ def test_keep_sets_nothing_if_it_cannot_write_the_file(
     if why != "no configuration file":
         file.touch(0o444 if why == "it is read-only" else 0o644)
     monkeypatch.setattr("acsard.host.config_file.SEARCH_PATHS", (file,))
-    monkeypatch.setattr("acsard.cli.connection.open_connection", lambda *words, **more: robot)
+    monkeypatch.setattr("acsard.cli.robot_options.open_connection", lambda *words, **more: robot)
     monkeypatch.setattr("acsard.cli.set.is_daemon_here", lambda pid: why != "another machine")
     assert main(["set", "rates.telemetry", "5", "--keep"]) == 1
     assert why in capsys.readouterr().err

@@ -7,7 +7,7 @@ from threading import Event
 
 import zenoh
 
-from acsard.bus.tls import host_and_port
+from acsard.bus.tls_files import host_and_port
 from acsard.core.config.settings import BusConfig
 from acsard.core.values import RoutersStatus
 from acsard.host.mailbox import Mailbox

@@ -13,7 +13,7 @@ import zenoh
 from zenoh.handlers import Callback
 
 from acsard.bus.certificate_watch import CertificateFiles
-from acsard.bus.tls import expiry_times, files_in, require_usable
+from acsard.bus.tls_files import expiry_times, files_in, require_usable
 from acsard.bus.zenoh_sessions import MAX_SESSIONS, answers, gateway_session
 from acsard.core.config.settings import Config
 from acsard.core.messages.encodings import encode, encoding_name

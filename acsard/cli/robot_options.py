@@ -12,7 +12,7 @@ from msgspec import to_builtins
 
 from acsard.bus.address import Address, address_of
 from acsard.bus.robot_discovery import ALL_ROBOTS, Presence, explain_silence, parse_ids, presence
-from acsard.bus.tls import trouble
+from acsard.bus.tls_trouble import trouble
 from acsard.cli.common import add_config, load
 from acsard.client.connection import Connection, open_connection
 from acsard.client.follower import FIRST_STATE_TIMEOUT_S

@@ -18,7 +18,7 @@ from msgspec import Struct
 
 from acsard.bus.address import Address
 from acsard.bus.certificate_watch import CertificateFiles
-from acsard.bus.tls import CERTIFICATE, KEY, files_in, names_in
+from acsard.bus.tls_files import CERTIFICATE, KEY, files_in, names_in
 from acsard.bus.zenoh_sessions import client_session
 from acsard.client.connection import Connection
 from acsard.core.config.settings import Config
