@@ -7,9 +7,7 @@ import shutil
 import stat
 import subprocess
 import sys
-import tempfile
 import tomllib
-from collections.abc import Iterator
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
@@ -27,7 +25,6 @@ from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
 from acsard.cli import main
 from acsard.core.config.parsing import parse
-from acsard.host.errors import Exit
 from acsard.host.own_identity import own_addresses
 
 ROLES = ("viewer", "operator", "maintainer")
@@ -222,58 +219,6 @@ def test_add_issues_one_certificate_and_prints_the_lines_that_give_it_its_role(
     listed = {"viewer": access.viewers, "operator": access.operators}
     listed |= {"maintainer": access.maintainers}
     assert listed == {r: (r, name) if r == role else (r,) for r in ROLES}
-
-
-# refusals
-
-
-AS_NOBODY = """\
-import os, sys
-import acsard.machine.authority
-from acsard.cli import main
-try:
-    main(["tls", "init", "--help"])  # nobody may not be let read what is imported late
-except SystemExit:
-    pass
-if os.geteuid() == 0:
-    os.setgroups([])
-    os.setgid(65534)
-    os.setuid(65534)
-sys.exit(main(["tls", *sys.argv[1:]]))
-"""
-
-
-@pytest.fixture
-def locked() -> Iterator[Path]:
-    """Yield a directory that every user may enter and no user may write to.
-
-    All of its parent directories may be entered by every user too.
-    """
-    with tempfile.TemporaryDirectory() as name:
-        directory = Path(name)
-        directory.chmod(0o555)
-        yield directory
-        directory.chmod(0o755)
-
-
-@pytest.mark.variations(4)
-@pytest.mark.parametrize("below", [".", "tls"])
-@pytest.mark.parametrize("words", [["init"], ["add", "anna", "--role", "viewer"]], ids=str)
-def test_without_permission_it_ends_with_77_and_says_how_to_get_it(
-    locked: Path, below: str, words: list[str]
-) -> None:
-    done = subprocess.run(
-        [sys.executable, "-c", AS_NOBODY, *words, "--directory", str(locked / below)],
-        capture_output=True,
-        text=True,
-        timeout=30.0,
-    )
-    assert done.returncode == Exit.NO_PERMISSION, done
-    assert "--directory" in done.stderr
-    assert list(locked.iterdir()) == []
-
-
-# the configuration that `tls init` writes
 
 
 @pytest.mark.parametrize("name", ["", "robot4"])

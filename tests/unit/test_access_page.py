@@ -30,13 +30,10 @@ MAINTAINER = AdmittedClient("maintainer", LOCAL_NAME)
 @each(
     ("peer", "host"),
     [
-        ("127.0.0.1", "localhost:8080"),
-        ("127.0.0.1", "127.0.0.1:8080"),
-        ("127.8.8.8", "LOCALHOST"),
-        ("::1", "[::1]:8080"),
-        ("::ffff:127.0.0.1", "127.0.0.1"),
+        ("127.0.0.1", "localhost:8080"), ("127.0.0.1", "127.0.0.1:8080"),
+        ("127.8.8.8", "LOCALHOST"), ("::1", "[::1]:8080"), ("::ffff:127.0.0.1", "127.0.0.1"),
     ],
-)
+)  # fmt: skip
 def test_a_browser_on_the_robot_s_machine_is_local(peer: str, host: str) -> None:
     assert place(RequestFacts(peer, False, host), NAMES) == "here"
     assert place(RequestFacts(peer, True, host), NAMES) == "here"
@@ -98,16 +95,11 @@ def test_the_robot_s_own_page_and_programs_pass_the_origin_check(
 @each(
     ("origin", "site"),
     [
-        ("http://evil.example", None),
-        ("https://localhost:8080", None),
-        ("http://localhost:8081", None),
-        ("http://localhost", None),
-        ("null", None),
-        ("", None),
-        (None, "cross-site"),
-        (None, "same-site"),
+        ("http://evil.example", None), ("https://localhost:8080", None),
+        ("http://localhost:8081", None), ("http://localhost", None), ("null", None), ("", None),
+        (None, "cross-site"), (None, "same-site"),
     ],
-)
+)  # fmt: skip
 def test_a_page_of_another_origin_is_refused(origin: str | None, site: str | None) -> None:
     with pytest.raises(RequestRefusedError) as error:
         require_own_origin(RequestFacts("127.0.0.1", False, "localhost:8080", origin, site))

@@ -31,18 +31,13 @@ def names(checked: Checked) -> set[str]:
 @pytest.mark.parametrize(
     ("computer", "fault", "late_s", "every"),
     [
-        (Busy, "no_sample", 0.04, 2),
-        (Busy, "plain_only", 0.15, 5),
-        (Starved, "no_sample", 0.4, 40),
-        (Busy, "free_running", 0.06, 3),
-        (Busy, "no_sample", 0.4, 11),
-        (Starved, "free_running", 0.15, 9),
-        (Starved, "plain_only", 0.06, 3),
-        (Starved, "plain_only", 0.4, 11),
-        (Busy, "no_sample", 0.03, 1),
-        (Starved, "no_sample", 0.15, 9),
+        (Busy, "no_sample", 0.04, 2), (Busy, "plain_only", 0.15, 5),
+        (Starved, "no_sample", 0.4, 40), (Busy, "free_running", 0.06, 3),
+        (Busy, "no_sample", 0.4, 11), (Starved, "free_running", 0.15, 9),
+        (Starved, "plain_only", 0.06, 3), (Starved, "plain_only", 0.4, 11),
+        (Busy, "no_sample", 0.03, 1), (Starved, "no_sample", 0.15, 9),
     ],
-)
+)  # fmt: skip
 def test_on_a_late_computer_no_board_is_blamed_and_no_other_setting_is_proposed(
     computer: type[Busy], fault: str, late_s: float, every: int
 ) -> None:
@@ -114,18 +109,13 @@ def test_no_motor_is_turned_again_after_a_silence() -> None:
 @each(
     ("outcome", "late_s", "doubted"),
     [
-        ("watchdog: late", MAX_LATENESS_S, True),
-        ("watchdog: late", 0.9 * MAX_LATENESS_S, False),
-        ("watchdog: right", MAX_LATENESS_S, False),
-        ("watchdog: right", MAX_PAUSE_S, True),
-        ("watchdog: none", 10.0, False),
-        ("reply rate: slow", MAX_LATENESS_S, True),
-        ("lost lines: none", 10.0, False),
-        ("motor: reversed, not seen", 10.0, False),
-        ("motor: size", MAX_LATENESS_S, False),
-        ("motor: size", 0.5, True),
+        ("watchdog: late", MAX_LATENESS_S, True), ("watchdog: late", 0.9 * MAX_LATENESS_S, False),
+        ("watchdog: right", MAX_LATENESS_S, False), ("watchdog: right", MAX_PAUSE_S, True),
+        ("watchdog: none", 10.0, False), ("reply rate: slow", MAX_LATENESS_S, True),
+        ("lost lines: none", 10.0, False), ("motor: reversed, not seen", 10.0, False),
+        ("motor: size", MAX_LATENESS_S, False), ("motor: size", 0.5, True),
     ],
-)
+)  # fmt: skip
 def test_only_outcomes_that_a_late_computer_can_cause_are_doubted(
     outcome: str, late_s: float, doubted: bool
 ) -> None:

@@ -80,24 +80,18 @@ def channel_of(motor: int, encoder: int, forth: float = 3.0, back: float = -3.0)
 @each(
     ("channel", "kind"),
     [
-        (channel_of(0, 0), "right"),
-        (channel_of(0, 0, 3.1, -2.9), "right"),
-        (channel_of(0, 0, 3.7, -2.3), "off"),
-        (channel_of(0, 0, 2.4, -2.4), "off"),
+        (channel_of(0, 0), "right"), (channel_of(0, 0, 3.1, -2.9), "right"),
+        (channel_of(0, 0, 3.7, -2.3), "off"), (channel_of(0, 0, 2.4, -2.4), "off"),
         (channel_of(0, 0, 2.9, -3.2), "off"),
         (structs.replace(channel_of(0, 0, 3.0, -2.75), unsure=0.05), "right"),
-        (channel_of(0, 0, 4.0, -3.0), "size"),
-        (channel_of(0, 0, 2.0, -2.0), "size"),
-        (channel_of(0, 0, -3.0, 3.0), "reversed"),
-        (channel_of(0, 0, 3.0, 3.0), "no sign"),
-        (channel_of(0, 0, 0.0, 0.0), "dead"),
-        (channel_of(0, 0, 3.0, 0.0), "one way"),
-        (channel_of(0, 2), "other"),
-        (channel_of(0, 2, -3.0, 3.0), "other"),
+        (channel_of(0, 0, 4.0, -3.0), "size"), (channel_of(0, 0, 2.0, -2.0), "size"),
+        (channel_of(0, 0, -3.0, 3.0), "reversed"), (channel_of(0, 0, 3.0, 3.0), "no sign"),
+        (channel_of(0, 0, 0.0, 0.0), "dead"), (channel_of(0, 0, 3.0, 0.0), "one way"),
+        (channel_of(0, 2), "other"), (channel_of(0, 2, -3.0, 3.0), "other"),
         (Channel(1, (3.0, 3.0, 0.0, 0.0), (-3.0, -3.0, 0.0, 0.0)), "several"),
         (Channel(1, (3.0, 0.0, 0.0, 0.0), (0.0, -3.0, 0.0, 0.0)), "several"),
     ],
-)
+)  # fmt: skip
 def test_the_speeds_of_the_encoders_decide_the_kind_and_verdict_of_a_motor(
     channel: Channel, kind: Kind
 ) -> None:

@@ -29,17 +29,12 @@ from tests.each import each
 from tests.unit.screens import STATE
 
 PROMISED = [
-    (errors.UsageError, ValueError, 2),
-    (errors.ReplyError, RuntimeError, 1),
-    (errors.NotDrivenError, RuntimeError, 1),
-    (errors.RecordingError, ValueError, 1),
-    (errors.NoPortError, FileNotFoundError, 66),
-    (errors.UnreachableError, ConnectionError, 69),
-    (errors.NoAnswerError, TimeoutError, 69),
-    (errors.InUseError, OSError, 75),
-    (errors.NotPermittedError, PermissionError, 77),
-    (errors.CertificateError, ValueError, 78),
-]
+    (errors.UsageError, ValueError, 2), (errors.ReplyError, RuntimeError, 1),
+    (errors.NotDrivenError, RuntimeError, 1), (errors.RecordingError, ValueError, 1),
+    (errors.NoPortError, FileNotFoundError, 66), (errors.UnreachableError, ConnectionError, 69),
+    (errors.NoAnswerError, TimeoutError, 69), (errors.InUseError, OSError, 75),
+    (errors.NotPermittedError, PermissionError, 77), (errors.CertificateError, ValueError, 78),
+]  # fmt: skip
 """Error class, built-in base class and exit code, as section 6 of DESIGN lists them."""
 
 

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Callable, Collection, Sequence
 from itertools import count
 from types import SimpleNamespace
-from typing import Any, cast
+from typing import Any
 
 import pytest
 import zenoh
@@ -14,12 +13,10 @@ from msgspec.structs import replace
 
 from acsard.bus.address import Address
 from acsard.bus.subscription import Subscription
-from acsard.client.connection import Connection
 from acsard.client.follower import (
     FLEET_QUERY_PERIOD_S,
 )
-from acsard.core.messages.encodings import DecodeError
-from acsard.core.messages.schema import Info, RobotState, Time
+from acsard.core.messages.schema import Time
 from acsard.top import feed as top_feed
 from acsard.top import roster as rosters
 from acsard.top.feed import Feed
@@ -175,74 +172,24 @@ def test_a_daemon_that_hangs_is_silent_though_a_storage_answers_for_it(
 
 # one robot
 
-KEY = "acsard/acsar/state"
 
-
-class Robot:
-    """A client without a bus that gives states at times set by the test."""
-
-    where = Address("tcp/127.0.0.1:7448", "acsar", "")
-
-    def __init__(self) -> None:
-        self.now = 100.0
-        self.state: RobotState | DecodeError = STATE
-        self.queue: deque[Any] = deque()
-
-    def start_query(self, name: str, take: Any) -> None:
-        """Do nothing: the query of the follower gets no answer."""
-
-    def key(self, name: str) -> str:
-        return f"acsard/acsar/{name}"
-
-    def get(self, name: str) -> RobotState | Info:
-        if name == "info":
-            return INFO
-        if isinstance(self.state, DecodeError):
-            raise self.state
-        return self.state
-
-    def subscribe(self, name: str) -> Subscription:
-        assert name == "state"
-        return Subscription(self, KEY)
-
-    def try_recv(self) -> Any:
-        return self.queue.popleft() if self.queue else None
-
-    def tells(self, state: RobotState, key: str = KEY) -> None:
-        self.queue.append(sample_of(state, key))
-
-
-@pytest.fixture
-def robot(monkeypatch: pytest.MonkeyPatch) -> Robot:
-    robot = Robot()
-    monkeypatch.setattr(top_feed, "clock", SimpleNamespace(steady_s=lambda: robot.now))
-    return robot
-
-
-def feed_of(robot: Robot) -> Feed:
-    return Feed(cast(Connection, robot))
-
-
-def at(sec: int, lines: int = 1300) -> RobotState:
-    counters = STATE.counters | {"lines": lines}
-    return replace(STATE, stamp=Time(sec), counters=counters)
-
-
-def test_the_time_between_two_states_is_measured_by_the_viewer_s_clock(robot: Robot) -> None:
-    feed = feed_of(robot)
-    assert feed.screen_data().passed == 0.0
-    feed.query_state()
-    robot.now += 0.8
-    robot.state = at(9000)
-    feed.query_state()
-    assert feed.screen_data().passed == pytest.approx(0.8)
-
-
-def test_the_rates_begin_again_when_another_daemon_answers(robot: Robot) -> None:
-    feed = feed_of(robot)
-    robot.tells(STATE)
+def test_rates_are_between_two_states_of_one_daemon_by_the_viewer_s_clock(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    clock, states, key = Clock(), [STATE], "acsard/acsar/state"
+    monkeypatch.setattr(top_feed, "clock", SimpleNamespace(steady_s=lambda: clock.now))
+    queue: Any = SimpleNamespace(try_recv=lambda: sample_of(states.pop(0), key) if states else None)
+    robot: Any = SimpleNamespace(
+        where=Address("tcp/127.0.0.1:7448", "acsar", ""), get=lambda _: INFO, key=lambda _: key,
+        start_query=lambda *_: None, subscribe=lambda _: Subscription(queue, key),
+    )  # fmt: skip
+    feed = Feed(robot)
     feed.poll()
-    robot.now += 0.1
-    robot.tells(BEFORE)  # its counters are smaller
+    assert feed.screen_data().passed == 0.0
+    clock.now += 0.8
+    states.append(replace(STATE, stamp=Time(9000)))
+    feed.poll()
+    assert feed.screen_data().passed == pytest.approx(0.8)
+    states.append(BEFORE)  # another daemon's, whose counters are smaller
     feed.poll()
     assert (feed.screen_data().before, feed.screen_data().state) == (BEFORE, BEFORE)

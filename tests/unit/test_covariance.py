@@ -170,25 +170,6 @@ def test_a_gap_of_years_leaves_a_variance_of_1e9_and_no_more() -> None:
     assert max(map(abs, robot.odometry.uncertainty.bend.added)) < 1.0
 
 
-def driven(accelerations: list[float], gap: tuple[int, int]) -> tuple[float, float, float]:
-    """Drive with lines every 10 ms, of which those in `gap` are lost.
-
-    Returns the true distance, that of the odometry, and its standard deviation, m.
-    """
-    robot, speed, true, lost = Odometer(EXACT), 0.0, 0.0, 0
-    for number, acceleration in enumerate(accelerations):
-        # A report is the mean of its period.
-        before, speed = speed, max(0.0, min(1.0, speed + acceleration * 0.01))
-        mean = (before + speed) / 2
-        true += mean * 0.01
-        if gap[0] <= number < gap[1]:
-            lost += 1
-            continue
-        filled, lost = lost * 0.01, 0
-        estimate = robot.fold(line(mean / RADIUS, 0.01 + filled, bridged=filled, driven=1.0))
-    return true, estimate.pose.x, math.sqrt(estimate.covariance.xx - 1e-6)
-
-
 @each("share", [0.0, 0.3, 1.0])
 def test_a_pose_that_is_set_in_a_silence_knows_that_a_part_of_it_came_before(share: float) -> None:
     """The line that ends the silence has the counts of all of it, and none says when they came."""

@@ -59,12 +59,8 @@ def test_a_stamp_that_no_signature_holds_is_refused(stamp: float) -> None:
 @each(
     ("text", "about"),
     [
-        ("", "message"),
-        ("[]", "message"),
-        ("{}", "message"),
-        ('"stop"', "message"),
-        ('{"go": 1}', "message"),
-        ('{"ping": 1, "call": "stop"}', "message"),
+        ("", "message"), ("[]", "message"), ("{}", "message"), ('"stop"', "message"),
+        ('{"go": 1}', "message"), ('{"ping": 1, "call": "stop"}', "message"),
         ('{"cmd": {"linear_x": 0.2}, "stamp": 1}', "cmd"),
         ('{"cmd": {"linear_x": 0.2, "angular_z": 0, "linear_y": 1}, "stamp": 1}', "cmd"),
         ('{"cmd": {"linear_x": NaN, "angular_z": 0}, "stamp": 1}', "message"),
@@ -77,12 +73,10 @@ def test_a_stamp_that_no_signature_holds_is_refused(stamp: float) -> None:
         ('{"cmd": {"linear_x": 0.2, "angular_z": 0}, "stamp": 1e300}', "cmd"),
         ('{"cmd": {"linear_x": 0.2, "angular_z": 0}, "stamp": 1, "sender": "you"}', "cmd"),
         ('{"subscribe": "odom", "rate": 0}', "subscribe"),
-        ('{"subscribe": "odom", "rate": 51}', "subscribe"),
-        ('{"subscribe": 1}', "subscribe"),
-        ('{"call": "stop", "payload": []}', "call"),
-        ("[" * 5000 + "]" * 5000, "message"),
+        ('{"subscribe": "odom", "rate": 51}', "subscribe"), ('{"subscribe": 1}', "subscribe"),
+        ('{"call": "stop", "payload": []}', "call"), ("[" * 5000 + "]" * 5000, "message"),
     ],
-)
+)  # fmt: skip
 def test_an_invalid_message_is_refused_with_the_kind_it_was_meant_as(text: str, about: str) -> None:
     with pytest.raises(FrameError) as caught:
         decode(text)
@@ -91,14 +85,10 @@ def test_an_invalid_message_is_refused_with_the_kind_it_was_meant_as(text: str, 
 
 
 INVALID_STOPS = [
-    '{"call": "stop", "id": null}',
-    '{"call": "stop", "id": 1e999}',
-    '{"call": "stop", "id": true}',
-    '{"call": "stop", "id": 1, "payload": []}',
-    '{"call": "stop", "id": 1, "payload": null}',
-    '{"call": "stop", "id": 1, "extra": 1}',
-    '{"call": "stop", "id": 1, "subscribe": "odom"}',
-]
+    '{"call": "stop", "id": null}', '{"call": "stop", "id": 1e999}', '{"call": "stop", "id": true}',
+    '{"call": "stop", "id": 1, "payload": []}', '{"call": "stop", "id": 1, "payload": null}',
+    '{"call": "stop", "id": 1, "extra": 1}', '{"call": "stop", "id": 1, "subscribe": "odom"}',
+]  # fmt: skip
 """Invalid messages that ask the robot to stop."""
 
 
@@ -123,13 +113,10 @@ GREETING = socket_messages.Greeting(
 )  # fmt: skip
 
 SAID: tuple[Struct, ...] = (
-    socket_messages.Hello(GREETING),
-    socket_messages.DrivenPath([(0.0, 1.5)]),
-    socket_messages.Answer(7, True, "stopped"),
-    socket_messages.Pong(12.5, 1e12),
-    socket_messages.Refused("cmd", "why"),
-    socket_messages.DaemonUnreachable("why"),
-)
+    socket_messages.Hello(GREETING), socket_messages.DrivenPath([(0.0, 1.5)]),
+    socket_messages.Answer(7, True, "stopped"), socket_messages.Pong(12.5, 1e12),
+    socket_messages.Refused("cmd", "why"), socket_messages.DaemonUnreachable("why"),
+)  # fmt: skip
 
 
 def as_sent(message: object) -> Any:

@@ -100,3 +100,9 @@ def test_each_line_names_the_client_with_the_most_refusals_since_the_last_line()
     event = counts.new_refusals()
     assert event is not None
     assert event.text == "1 role; 1 from 192.168.1.7"
+    counts.refuse("slow")
+    event = counts.new_refusals()
+    assert event is not None
+    assert (event.name, event.level, event.count) == ("page_refused", "warning", 1)
+    assert event.text == "1 slow"
+    assert counts.new_refusals() is None

@@ -87,8 +87,7 @@ def test_a_path_that_is_not_a_device_has_no_holder(path: str) -> None:
 @each(
     ("command", "name"),
     [
-        (tuple(acsard("run")), "acsard run"),
-        (("acsard", "sim"), "acsard"),
+        (tuple(acsard("run")), "acsard run"), (("acsard", "sim"), "acsard"),
         (("/opt/acsard/0.2.0/bin/acsard", "run", "--config", "x.toml"), "acsard run"),
         (("/usr/bin/python3.13", "/opt/acsard/0.2.0/bin/acsard", "run"), "acsard run"),
         (("python", "-m", "acsard", "run"), "acsard run"),
@@ -97,16 +96,12 @@ def test_a_path_that_is_not_a_device_has_no_holder(path: str) -> None:
         (("python3", "-P", "-X", "utf8", "bin/acsard", "web"), "acsard"),
         (("screen", "-S", "acsard", "/dev/ttyACM0"), "other"),
         (("tail", "-f", "/dev/null", "/tmp/acsard"), "other"),
-        (("python3", "logger.py", "acsard"), "other"),
-        (("python3", "-m", "other", "run"), "other"),
+        (("python3", "logger.py", "acsard"), "other"), (("python3", "-m", "other", "run"), "other"),
         (("python3", "-m", "serial.tools.miniterm", "acsard"), "other"),
-        (("python3", "-c", "input()", "acsard"), "other"),
-        (("python3", "-X", "acsard"), "other"),
-        (("python3", "-", "acsard"), "other"),
-        (("python3",), "other"),
-        ((), "other"),
+        (("python3", "-c", "input()", "acsard"), "other"), (("python3", "-X", "acsard"), "other"),
+        (("python3", "-", "acsard"), "other"), (("python3",), "other"), ((), "other"),
     ],
-)
+)  # fmt: skip
 def test_only_a_process_that_executes_acsard_has_its_name_and_a_daemon_runs_run(
     command: tuple[str, ...], name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -97,12 +97,7 @@ def test_a_cause_that_a_later_version_added_still_holds_the_robot(index: int) ->
 @each(
     "data",
     [
-        b"",
-        b"\0" * 512,
-        b"[" * 5000,
-        b"[1, 2]",
-        b'{"format": "3"}',
-        b'{"format": 3}',
+        b"", b"\0" * 512, b"[" * 5000, b"[1, 2]", b'{"format": "3"}', b'{"format": 3}',
         encode("acsar", ALL).replace(b'"format": 3', b'"format": 2'),
         encode("acsar", ALL).replace(b'"format": 3', b'"format": 4'),
         encode("acsar", ALL).replace(b'"causes"', b'"cause"'),
@@ -115,7 +110,7 @@ def test_a_cause_that_a_later_version_added_still_holds_the_robot(index: int) ->
         encode("acsar", ALL).replace(b"1800000000000000000", b"9223372036854775808"),
         encode("other", ALL),
     ],
-)
+)  # fmt: skip
 def test_a_file_without_latches_of_this_robot_is_refused(data: bytes) -> None:
     with pytest.raises(LatchFileError):
         decode("acsar", data)

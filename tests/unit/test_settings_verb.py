@@ -17,20 +17,11 @@ from tests.each import each
 @each(
     ("word", "value"),
     [
-        ("0.8", 0.8),
-        ("-1", -1),
-        ("true", True),
-        ("debug", "debug"),
-        ('"debug"', "debug"),
-        ("[1, 2.5]", [1, 2.5]),
-        ("nan and more", "nan and more"),
-        ("1\nother = 2", "1\nother = 2"),
-        ("", ""),
-        ("'", "'"),
-        ("2026-01-01", "2026-01-01"),
-        ("{a = 1}", "{a = 1}"),
+        ("0.8", 0.8), ("-1", -1), ("true", True), ("debug", "debug"), ('"debug"', "debug"),
+        ("[1, 2.5]", [1, 2.5]), ("nan and more", "nan and more"), ("1\nother = 2", "1\nother = 2"),
+        ("", ""), ("'", "'"), ("2026-01-01", "2026-01-01"), ("{a = 1}", "{a = 1}"),
     ],
-)
+)  # fmt: skip
 def test_a_value_is_written_as_in_the_file_and_a_bare_word_is_a_text(
     word: str, value: object
 ) -> None:
