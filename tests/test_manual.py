@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import re
+import runpy
 from zipfile import ZipFile
 
 import pytest
 
-from deploy.manual.build import build
+from acsard.web import manual
 from tests.each import each
 from tests.pages import MANUAL, ROOT, prose, text_of
 
@@ -85,7 +86,9 @@ def test_the_page_of_the_counters_has_each_name_that_the_product_counts() -> Non
 def site(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
     """Build the manual strictly, and return the text of each of its HTML files by name."""
     out = tmp_path_factory.mktemp("built") / "manual.zip"
-    build(out)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(manual, "MANUAL", out)
+        runpy.run_path(str(HERE / "build.py"), run_name="__main__")
     with ZipFile(out) as files:
         return {
             name: files.read(name).decode() for name in files.namelist() if name.endswith(".html")

@@ -24,9 +24,10 @@ MISSING = b"""<!doctype html>
 <html lang="en"><meta charset="utf-8"><meta name="viewport" content="width=device-width">
 <title>Manual</title>
 <h1>This installation has no manual</h1>
-<p>The packages of a release contain the manual of their version. In a clone, this command makes it
-for the next start of the page:
-<pre>.venv/bin/python deploy/manual/build.py acsard/manual.zip</pre>
+<p>The packages of a release contain the manual of their version. In a clone, these commands make
+it for the next start of the page:
+<pre>.venv/bin/pip install '.[manual]'
+.venv/bin/python deploy/manual/build.py</pre>
 <p>The same pages are Markdown in the source, in <code>deploy/manual/pages</code>.
 """
 

@@ -1,9 +1,10 @@
 """Builds the manual strictly into one zip file, with `index.html` at its top.
 
-    .venv/bin/python deploy/manual/build.py acsard/manual.zip
+    .venv/bin/python deploy/manual/build.py
 
-It needs zensical. The same pages give the same bytes. Unpacked, the site is five times as large,
-because each page has its own copy of the contents.
+It needs the extra `manual`, and writes the file that the page of this Python's acsard serves. The
+same pages give the same bytes. Unpacked, the site is five times as large, because each page has its
+own copy of the contents.
 """
 
 from __future__ import annotations
@@ -41,6 +42,7 @@ def build(out: Path) -> None:
 
 
 if __name__ == "__main__":
-    if len(sys.argv) != 2:
-        sys.exit("usage: build.py FILE.zip")
-    build(Path(sys.argv[1]))
+    # The environment of a release builds without the libraries of the page.
+    from acsard.web.manual import MANUAL
+
+    build(MANUAL)

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import asyncio
 import random
+import re
+import tomllib
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from pathlib import Path
@@ -14,6 +16,7 @@ import pytest
 from yarl import URL
 
 from acsard.web.manual import manual_files
+from tests.pages import ROOT
 from tests.unit.test_page_whole import Whole
 
 HOME = b"<h1>acsard</h1><script>go()</script>"
@@ -109,4 +112,9 @@ async def test_without_a_manual_a_page_says_how_to_get_it(tmp_path: Path) -> Non
             session.get(url / "docs/howto/wire.html") as answer,
         ):
             assert (answer.status, answer.content_type) == (404, "text/html")
-            assert "deploy/manual/build.py acsard/manual.zip" in await answer.text()
+            text = await answer.text()
+    (needed,) = re.findall(r"pip install '\.\[(\w+)\]'", text)
+    (script,) = re.findall(r"python (\S+\.py)", text)
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    assert project["optional-dependencies"][needed][0].startswith("zensical")
+    assert (ROOT / script).exists()
