@@ -126,7 +126,10 @@ class Page:
     async def manual(self, request: web.Request) -> web.StreamResponse:
         if not self._manual:
             return web.Response(status=404, body=MISSING, content_type="text/html")
-        return _send(request, self._manual, request.match_info["file"] or "index.html")
+        name = request.match_info["file"] or "index.html"
+        if f"{name}.html" in self._manual:
+            raise web.HTTPFound(f"/docs/{name}.html")
+        return _send(request, self._manual, name)
 
     async def token(self, request: web.Request) -> web.StreamResponse:
         """Return the token of the body in a cookie that no script can read.
