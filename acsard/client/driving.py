@@ -23,6 +23,7 @@ from acsard.client.ride import (
     SEND_PERIOD_S,
     SILENCE,
     Ride,
+    can_drive,
     lacks_only_commands,
     objection,
     receives_commands,
@@ -199,9 +200,10 @@ def turn(degrees: float, speed: float) -> Steps:
 def _course(begin: Callable[[Odometry], Course]) -> Steps:
     # The steps raise the errors of `drive`.
     def steps(driver: Driver) -> Generator[Seconds, None, None]:
-        with closing(_Odometer(driver.robot)) as odometer:
+        with closing(_Odometer(driver)) as odometer:
             while (odom := odometer.newest()) is None:
                 yield COURSE_PERIOD_S
+                driver.take()
             course, nearest, nearer = begin(odom), math.inf, odometer.received
             while not course.is_done:
                 now = clock.steady_s()
@@ -228,21 +230,30 @@ def _course(begin: Callable[[Odometry], Course]) -> Steps:
 
 
 class _Odometer:
-    def __init__(self, robot: CommandClient) -> None:
-        self._samples, self._decoder = robot.subscribe("odom"), Decoder(Odometry)
+    def __init__(self, driver: Driver) -> None:
+        self._driver = driver
+        self._samples, self._decoder = driver.robot.subscribe("odom"), Decoder(Odometry)
         self.received = clock.steady_s()
         self.close = self._samples.undeclare
 
     def newest(self) -> Odometry | None:
-        """Return the newest message that has arrived since the last call. Raises `NoAnswerError`"""
+        """Return the newest message that has arrived since the last call, or None.
+
+        Raises:
+            NotDrivenError: nothing has arrived for some time, because the robot cannot drive.
+            NoAnswerError: nothing has arrived, although it can.
+        """
         now, odom = clock.steady_s(), None
         while (sample := self._samples.try_recv()) is not None:
             with suppress(DecodeError):
                 odom, self.received = self._decoder.decode(*encoded(sample)), now
         if now - self.received > FIRST_STATE_TIMEOUT_S:
+            self._driver.require()
+            state = self._driver.watch.state
+            if state is not None and not can_drive(state):
+                raise NotDrivenError(state.why)
             raise NoAnswerError(
-                "no odometry arrives, so the way cannot be measured: does the board send feedback "
-                "(`acsard doctor`), and is rates.odom above 10 Hz?"
+                "no odometry arrives, so the way cannot be measured: is rates.odom above 10 Hz?"
             )
         return odom
 

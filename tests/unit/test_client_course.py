@@ -8,6 +8,7 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
+from msgspec.structs import replace
 
 from acsard.client.course import Course, Straight, Turn
 from acsard.client.driving import Driver, Steps, move, turn
@@ -27,7 +28,7 @@ from acsard.host import clock
 from acsard.host.errors import NoAnswerError, NotDrivenError
 from tests.each import each
 from tests.unit.screens import sample_of
-from tests.unit.test_client_driving import World, followed
+from tests.unit.test_client_driving import STOPPED, Says, World, after, followed
 
 PERIOD_S = 0.01
 
@@ -90,8 +91,8 @@ def _clock(monkeypatch: pytest.MonkeyPatch) -> None:
 class WithOdometry(World):
     """A robot that publishes its odometry for some time, and does not move."""
 
-    def __init__(self, seconds: float) -> None:
-        super().__init__(followed)
+    def __init__(self, seconds: float, responder: Says = followed) -> None:
+        super().__init__(responder)
         self.body = Robot(0.0)
         self._odometry_s = seconds
 
@@ -120,6 +121,15 @@ def test_a_move_stops_when_the_odometry_falls_silent() -> None:
     assert 0.3 in world.sent
     # The error comes 2 s after the last message, and zeros from 0.2 s after it until rest.
     assert next(n for n, speed in enumerate(reversed(world.sent)) if speed) >= 10
+
+
+def test_a_move_of_a_robot_that_waits_for_its_board_ends_with_that_reason() -> None:
+    missing = "/dev/ttyACM0 does not exist; plug the device in"
+    world = WithOdometry(0.0, after(0.0, replace(STOPPED, mode="waiting", reason=missing)))
+    with pytest.raises(NotDrivenError, match=missing):
+        world.move()
+    assert world.passed < 3.0
+    assert world.sent == []
 
 
 def test_a_move_of_a_robot_that_does_not_move_ends_after_three_seconds() -> None:
