@@ -14,11 +14,9 @@ from tests.systemd.container import (
     Board,
     Container,
     Driver,
-    UnavailableError,
-    build,
-    needs,
     unavailable,
 )
+from tests.systemd.image import UnavailableError, build, needs
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

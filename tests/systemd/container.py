@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import json
 import os
-import platform
 import shutil
 import signal
 import subprocess
@@ -22,16 +21,7 @@ from typing import Any, NamedTuple, NoReturn
 import pytest
 
 from tests.system.harness import ROOT, FarPeer, Program, until
-
-OURS = sys.version_info[:2]
-
-SUITES = {(3, 11): "bookworm", (3, 13): "trixie"}
-"""The Debian releases with our Python version, so that our installed packages run in there.
-
-With any other Python the container is the Debian that we run on, with our Python mounted into it.
-"""
-
-PACKAGES = "systemd,systemd-sysv,dbus,udev,umockdev,iproute2,python3-minimal,libpython3-stdlib"
+from tests.systemd.image import OURS, SUITES, UnavailableError, cgroups
 
 UNIT, GATEWAY, PAGE = "acsard.service", "acsard-gateway.service", "acsard-web.service"
 
@@ -62,63 +52,12 @@ LIES = "/run/board-lies"
 ACSARD = f"{HOME}/venv/bin/acsard"
 
 
-class UnavailableError(Exception):
-    """This machine cannot run the container. The message says why."""
-
-
 def unavailable(why: object) -> NoReturn:
     """Skip the test, or fail it if $ACSARD_TEST_SYSTEMD is "must", as in CI."""
     text = f"cannot boot a systemd: {why}"
     if os.environ.get("ACSARD_TEST_SYSTEMD") == "must":
         pytest.fail(text, pytrace=False)
     pytest.skip(text)
-
-
-def suite() -> str:
-    """Return the name of the Debian release to boot, or "" if none suits our Python version."""
-    if OURS in SUITES:
-        return SUITES[OURS]
-    try:
-        here = platform.freedesktop_os_release()
-    except OSError:
-        return ""
-    return here.get("VERSION_CODENAME", "") if here["ID"] == "debian" else ""
-
-
-def needs() -> str:
-    """Return the reason why this machine cannot boot a container, or "" if it can."""
-    if os.geteuid() != 0:
-        return "not root"
-    missing = [tool for tool in ("mmdebstrap", "systemd-nspawn") if shutil.which(tool) is None]
-    if missing:
-        return f"no {' and no '.join(missing)} (Debian: mmdebstrap, systemd-container)"
-    if not suite():
-        return "no Debian has Python {}.{}, and this is none that could be lent ours".format(*OURS)
-    return "" if _cgroups() else "no cgroup v2 hierarchy"
-
-
-def _cgroups() -> Path | None:
-    for place in (Path("/sys/fs/cgroup"), Path("/sys/fs/cgroup/unified")):
-        if (place / "cgroup.procs").exists() and (place / "cgroup.controllers").exists():
-            return place
-    return None
-
-
-def build(where: Path) -> Path:
-    """Make a root file system at `where`, unless this directory has one already."""
-    if (where / "usr/lib/systemd/systemd").exists():
-        return where
-    where.parent.mkdir(parents=True, exist_ok=True)
-    leave_out = ("doc", "locale", "man", "info")
-    words = ["mmdebstrap", "--quiet", "--variant=minbase", f"--include={PACKAGES}"]
-    words += ["--dpkgopt=force-unsafe-io"]
-    words += [f"--dpkgopt=path-exclude=/usr/share/{name}/*" for name in leave_out]
-    words += [suite(), str(where)]
-    done = subprocess.run(words, capture_output=True, text=True, check=False)
-    if done.returncode:
-        shutil.rmtree(where, ignore_errors=True)
-        raise UnavailableError(f"mmdebstrap: {done.stderr.strip()[-300:]}")
-    return where
 
 
 class Ran(NamedTuple):
@@ -138,7 +77,7 @@ class Container:
         """Prepare a container. The directory `keeps` preserves the services' state over reboots."""
         self._rootfs, self._log, self._name = rootfs, scratch / "console", name
         self._keeps = keeps
-        root = _cgroups()
+        root = cgroups()
         assert root is not None
         self._cgroup = root / f"{name}-{os.getpid()}"
         self.leader = 0
@@ -473,8 +412,3 @@ class Driver(Program):
         )
         self.sends(speed)
         board.awaits(f"ap{speed / 0.05:05.2f}".encode(), after=obeyed)
-
-
-if __name__ == "__main__":  # `.ci/run` makes the root file system beside other work
-    if not needs():
-        build(Path(sys.argv[1]))

@@ -11,7 +11,8 @@ from contextlib import suppress
 import aiohttp
 
 from tests.system.hosts import inside, ip
-from tests.systemd.container import Container, UnavailableError
+from tests.systemd.container import Container
+from tests.systemd.image import UnavailableError
 
 ROBOT_AT, PHONE_AT = "192.168.77.1", "192.168.77.2"
 """An address on a network that `lan.conf` names."""

@@ -26,9 +26,9 @@ from tests.systemd.container import (
     Board,
     Container,
     Driver,
-    UnavailableError,
     unavailable,
 )
+from tests.systemd.image import UnavailableError
 
 pytestmark = pytest.mark.systemd
 

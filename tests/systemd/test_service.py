@@ -20,9 +20,9 @@ from tests.systemd.container import (
     UNIT,
     VERSIONS,
     Container,
-    UnavailableError,
     unavailable,
 )
+from tests.systemd.image import UnavailableError
 
 pytestmark = pytest.mark.systemd
 

@@ -31,9 +31,9 @@ from tests.systemd.container import (
     Container,
     Driver,
     Ran,
-    UnavailableError,
     unavailable,
 )
+from tests.systemd.image import UnavailableError
 
 pytestmark = pytest.mark.systemd
 

@@ -20,9 +20,9 @@ from tests.systemd.container import (
     PAGE,
     UNIT,
     Container,
-    UnavailableError,
     unavailable,
 )
+from tests.systemd.image import UnavailableError
 from tests.systemd.phone import ROBOT_AT, STRANGE, Phone
 
 pytestmark = pytest.mark.systemd
