@@ -87,25 +87,10 @@ class Outputs(Struct, frozen=True):
 def outputs_of(now: Instant, robot: Robot, news: News, due: bool, line: bytes | None) -> Outputs:
     status = robot.status
     return Outputs(
-        now,
-        due,
-        line,
-        robot.speeds,
-        robot.applied,
-        status.link == "up",
-        news.estimates,
-        status.mode,
-        status.code,
-        status.reason,
-        status.link,
-        status.source,
-        robot.command_ns,
-        news.status_changed,
-        news.events,
-        news.answers,
-        news.urgent,
-        robot.latches,
-    )
+        now, due, line, robot.speeds, robot.applied, status.link == "up", news.estimates,
+        status.mode, status.code, status.reason, status.link, status.source, robot.command_ns,
+        news.status_changed, news.events, news.answers, news.urgent, robot.latches,
+    )  # fmt: skip
 
 
 def news_of(outputs: Outputs) -> News:
@@ -141,16 +126,7 @@ class SteppedRobot:
 
 def heard_of(inputs: Inputs) -> Heard:
     return Heard(
-        inputs.port_open,
-        inputs.opened,
-        inputs.port_trouble,
-        inputs.received,
-        inputs.commands,
-        inputs.refusals,
-        inputs.requests,
-        inputs.gyro,
-        inputs.speed_cap,
-        inputs.events,
-        inputs.missed,
-        inputs.shutting_down,
-    )
+        inputs.port_open, inputs.opened, inputs.port_trouble, inputs.received, inputs.commands,
+        inputs.refusals, inputs.requests, inputs.gyro, inputs.speed_cap, inputs.events,
+        inputs.missed, inputs.shutting_down,
+    )  # fmt: skip

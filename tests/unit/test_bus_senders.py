@@ -25,7 +25,7 @@ from acsard.core.incoming.commands import (
     caller_name,
     claimed_identity,
 )
-from acsard.core.messages.encodings import FORMATS, DecodeError, Format
+from acsard.core.messages.encodings import DecodeError, Format
 from acsard.core.messages.schema import Beat
 from acsard.core.messages.signature import (
     HASH_DIGITS,
@@ -78,21 +78,6 @@ def refusal(incoming: Arrival) -> str:
     with pytest.raises(DecodeError) as caught:
         RECEIVER.command(incoming)
     return caught.value.reason
-
-
-@pytest.mark.parametrize("form", FORMATS)
-def test_a_command_has_its_source_its_time_of_arrival_and_its_stamp(form: Format) -> None:
-    plain = Command(
-        "app", Twist(0.5, 0.2), ARRIVED_NS, None, "native/app", "native/app", shared=True
-    )
-    assert RECEIVER.command(ours(twist(), form)) == plain
-    with_header = replace(
-        plain, stamp_ns=3_000_000_004, clock="native/app, header on native/cmd/app"
-    )
-    assert RECEIVER.command(ours(stamped(3, 4), form)) == with_header
-    wheels = joints(1.0, 1.0, 1.0, 1.0) | {"header": {"stamp": {"sec": 9, "nanosec": 1}}}
-    sample = ours(wheels, form, key="wheel_cmd/app", stamp_ns=5)
-    assert RECEIVER.command(sample).stamp_ns == 9_000_000_001
 
 
 def test_commands_from_ros_are_those_of_their_source() -> None:

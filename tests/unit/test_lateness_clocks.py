@@ -16,7 +16,12 @@ from acsard.core.values import NS_PER_S
 from acsard.host.clock import MIN_SUSPEND_NS, SuspendDetector
 from acsard.host.event_loop import EventLoop
 from acsard.host.wait_timer import MAX_CALL_INTERVAL_NS, WaitTimer
-from tests.unit.privileges import WITHOUT_RAISING_LIMITS
+
+WITHOUT_RAISING_LIMITS = ("setpriv", "--bounding-set", "-sys_resource") if os.geteuid() == 0 else ()
+"""Words before a command, with which the command does not have CAP_SYS_RESOURCE.
+
+Only root has this capability.
+"""
 
 
 def test_each_suspend_is_reported_once() -> None:

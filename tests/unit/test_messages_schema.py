@@ -1,7 +1,4 @@
-"""The messages have the shape of their ROS 2 messages, and JSON Schemas that say what is accepted.
-
-A third-party validator judges by the schemas.
-"""
+"""The JSON Schemas say what a message has and what is accepted. A third-party validator judges."""
 
 from __future__ import annotations
 
@@ -19,7 +16,6 @@ from acsard.core.incoming.commands import Arrival, Receiver
 from acsard.core.incoming.imu import GyroFollower
 from acsard.core.incoming.queries import interfaces, topic_table
 from acsard.core.link.link_state import TRANSITIONS as LINKS
-from acsard.core.messages import schema
 from acsard.core.messages.cdr import Cdr
 from acsard.core.messages.encodings import DecodeError, encode
 from acsard.core.messages.json_schema import SCHEMAS
@@ -38,39 +34,6 @@ from acsard.core.motion.modes import Mode
 from acsard.core.values import GyroDoes, Role
 from tests.each import each
 from tests.unit.examples import OUTPUTS, SNAPSHOT, START, STATUS, due
-
-ROS_FIELDS: dict[str, tuple[str, ...]] = {
-    "Time": ("sec", "nanosec"),
-    "Header": ("stamp", "frame_id"),
-    "Vector3": ("x", "y", "z"),
-    "Quaternion": ("x", "y", "z", "w"),
-    "Twist": ("linear", "angular"),
-    "TwistStamped": ("header", "twist"),
-    "Pose": ("position", "orientation"),
-    "Imu": (
-        "header", "orientation", "orientation_covariance", "angular_velocity",
-        "angular_velocity_covariance", "linear_acceleration", "linear_acceleration_covariance",
-    ),
-    "PoseStamped": ("header", "pose"),
-    "PoseWithCovariance": ("pose", "covariance"),
-    "TwistWithCovariance": ("twist", "covariance"),
-    "Odometry": ("header", "child_frame_id", "pose", "twist"),
-    "Transform": ("translation", "rotation"),
-    "TransformStamped": ("header", "child_frame_id", "transform"),
-    "TFMessage": ("transforms",),
-    "JointState": ("header", "name", "position", "velocity", "effort"),
-    "KeyValue": ("key", "value"),
-    "DiagnosticStatus": ("level", "name", "message", "hardware_id", "values"),
-    "DiagnosticArray": ("header", "status"),
-}  # fmt: skip
-"""Fields in order, from the .msg files of common_interfaces and rcl_interfaces (ROS 2 Jazzy)."""
-
-
-@each(("name", "names"), ROS_FIELDS.items())
-def test_a_message_has_the_fields_of_its_ros_message_in_the_same_order(
-    name: str, names: tuple[str, ...]
-) -> None:
-    assert getattr(schema, name).__struct_fields__ == names
 
 
 @given(st.integers(-(2**31) * 10**9, 2**31 * 10**9 - 1))

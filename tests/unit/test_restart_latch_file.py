@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import _thread
 import asyncio
 import errno
 import fcntl
 import os
 import re
+import sys
+import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -48,6 +51,22 @@ Started = Callable[..., LatchFile]
 
 def config(where: Path | str) -> Config:
     return replace(Config(), control=ControlConfig(state_directory=str(where)))
+
+
+@pytest.fixture(autouse=True)
+def _traced(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let `coverage run` see the threads that are no objects of `threading`."""
+    start, trace = _thread.start_new_thread, threading.gettrace()
+
+    def traced(work: Callable[[], object], _: tuple[()]) -> int:
+        def seen() -> None:
+            sys.settrace(trace)
+            work()
+
+        return start(seen, ())
+
+    if trace is not None:
+        monkeypatch.setattr(_thread, "start_new_thread", traced)
 
 
 @pytest.fixture(name="started")

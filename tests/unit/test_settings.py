@@ -82,28 +82,6 @@ def test_each_configuration_has_its_problems_and_warnings(
 # defaults and ranges
 
 
-def test_the_defaults_are_those_of_the_original_robot() -> None:
-    config = Config()
-    assert contradictions(config) == warnings(config) == []
-    assert (config.robot.id, config.mcu.port, config.mcu.baud_rate) == ("acsar", "sim", 115200)
-    assert (config.drive.wheel_radius, config.drive.wheel_separation) == (0.05, 0.30)
-    assert (config.odometry.odom_frame, config.odometry.base_frame) == ("odom", "base_link")
-    assert config.lidar.lidar_frame == "lidar_link"
-    limits = config.limits
-    assert (limits.linear_speed, limits.angular_speed) == (1.0, 4.0)
-    assert (limits.linear_acceleration, limits.angular_acceleration) == (1.0, 4.0)
-    assert (limits.linear_deceleration, limits.angular_deceleration) == (1.0, 4.0)
-    assert (limits.linear_stop_deceleration, limits.angular_stop_deceleration) == (3.0, 12.0)
-    assert (limits.linear_jerk, limits.angular_jerk) == (0.0, 0.0)
-    assert [(s.name, s.priority, s.timeout, s.neutral_first) for s in config.commands.sources] == [
-        ("teleop", 100, 0.25, "zero"), ("app", 50, 0.25, "zero"),
-        ("ros2_control", 20, 0.25, "zero"), ("dock", 15, 0.25, "zero"), ("nav", 10, 0.25, "pause"),
-    ]  # fmt: skip
-    # The bus is on the loopback only, and not on the port of routers.
-    bus = config.bus
-    assert (bus.listen, bus.connect, bus.insecure) == (("tcp/127.0.0.1:7448",), (), False)
-
-
 def accepts(key: Key, value: float) -> bool:
     """Return whether the key's own range accepts `value`."""
     table: dict[str, Any] = {key.field.name: value}

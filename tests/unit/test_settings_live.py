@@ -135,13 +135,6 @@ def test_a_change_is_validated_like_the_file(
         assert problems(wishes) == judged
 
 
-def test_a_rule_between_keys_refuses_one_change_but_accepts_a_consistent_pair() -> None:
-    softer: dict[str, object] = {"limits.linear_deceleration": 0.15}
-    assert "would take 6.7 s, but at most" in problems(softer)[0]
-    made, _ = changed(CONFIG, softer | {"limits.linear_speed": 0.5}, True)
-    assert made.limits.linear_deceleration == 0.15
-
-
 @each(
     ("key", "value", "words"),
     [
