@@ -23,7 +23,7 @@ MANUAL = [str(path.relative_to(ROOT)) for path in sorted(ROOT.glob("deploy/manua
 
 PAGES += MANUAL
 
-_NOT_RUN = r"<!-- not run: (.*?) -->\n"
+_NOT_RUN = r"<!-- not run: ((?:(?! -->).)*) -->\n"
 _WHOLE_PAGE = re.compile(rf"\A# .*\n+{_NOT_RUN}")
 _FENCED = re.compile(rf"^ *(?:{_NOT_RUN} *)?```([a-z0-9]*)\n(.*?)^ *```$", re.M | re.S)
 
