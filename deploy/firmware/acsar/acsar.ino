@@ -10,8 +10,8 @@ const int ESTOP = -1;              // 37 if a second, normally-closed contact of
 const byte PWM[] = {5, 6, 7, 8}, FORWARD[] = {22, 24, 26, 28}, REVERSE[] = {23, 25, 27, 29};  // motors a to d
 const byte TICK_MS = 10;
 
-struct Sample { int counts[4]; unsigned long us; };
-volatile int counts[4];            // encoder a at A8 and A9, b at A10 and A11, c at A12 and A13, d at A14 and A15
+struct Sample { unsigned counts[4]; unsigned long us; };
+volatile unsigned counts[4];       // encoder a at A8 and A9, b at A10 and A11, c at A12 and A13, d at A14 and A15
 volatile byte levels;
 float wanted[4];                   // rad/s
 bool armed;                        // a line of zeros has come since the boot or the emergency stop
@@ -32,7 +32,7 @@ void measure(Sample &last, float speeds[4]) {  // the mean speeds since the last
   now.us = micros();
   interrupts();
   float rate = 1e6 * TWO_PI / COUNTS_PER_TURN / (now.us - last.us);
-  for (byte i = 0; i < 4; i++) speeds[i] = (now.counts[i] - last.counts[i]) * rate;
+  for (byte i = 0; i < 4; i++) speeds[i] = (int)(now.counts[i] - last.counts[i]) * rate;
   last = now;
 }
 
