@@ -24,11 +24,11 @@ from acsard.core.incoming.commands import (
     Receiver,
     caller_name,
     claimed_identity,
+    decode_limit,
     parts,
 )
 from acsard.core.incoming.imu import GyroFollower
 from acsard.core.incoming.queries import Query
-from acsard.core.incoming.speed_limit import decode_limit
 from acsard.core.messages.encodings import DecodeError
 from acsard.core.messages.keys_and_roles import IMU, SPEED_LIMIT
 from acsard.core.motion.kinematics import Kinematics

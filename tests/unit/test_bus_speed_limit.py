@@ -11,8 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from acsard.core.incoming.commands import Arrival, Via
-from acsard.core.incoming.speed_limit import decode_limit
+from acsard.core.incoming.commands import Arrival, Via, decode_limit
 from acsard.core.messages.encodings import FORMATS, DecodeError, Format, encode, encoding_name
 from acsard.core.messages.schema import Header, SpeedLimit, Time
 from acsard.core.ros.attachments import Attachment

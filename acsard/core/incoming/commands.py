@@ -1,4 +1,4 @@
-"""Decodes samples and service queries from the bus into a `Command` or a `Request`.
+"""Decodes samples and service queries into a `Command`, a `SpeedCap` or a `Request`.
 
 Refused are a DELETE, a key with a wildcard, a payload that is too big or cannot be decoded, NaN or
 infinity in a field that is read, and a sender id of another certificate. A refused command does not
@@ -17,7 +17,7 @@ from msgspec.structs import replace
 from acsard.core.config.settings import JointsConfig
 from acsard.core.messages import signature
 from acsard.core.messages.encodings import DecodeError, StrictDecoder, decode_cdr, detect
-from acsard.core.messages.keys_and_roles import COMMANDS, SERVICES
+from acsard.core.messages.keys_and_roles import COMMANDS, SERVICES, SPEED_LIMIT
 from acsard.core.messages.refusals import MAX_COMMAND_BYTES, require_size
 from acsard.core.messages.schema import (
     MESSAGES,
@@ -28,6 +28,7 @@ from acsard.core.messages.schema import (
     Release,
     SetPose,
     Settings,
+    SpeedLimit,
     SwitchOff,
     Twist,
     TwistStamped,
@@ -46,6 +47,7 @@ from acsard.core.values import (
     Ns,
     Pose,
     Request,
+    SpeedCap,
     Verb,
     WallNs,
     WheelSpeeds,
@@ -274,6 +276,29 @@ class Receiver:
                     )
                 return replace(request, pose=Pose(x, y, yaw))
         return request
+
+
+_limits = StrictDecoder(SpeedLimit)
+
+
+def decode_limit(arrival: Arrival, configured: float) -> SpeedCap:
+    """Return the speed limit in a sample; % are of `configured`, m/s. Raises `DecodeError`."""
+    if not arrival.put:
+        raise DecodeError("not_a_put", "a DELETE is not a speed limit: send a PUT")
+    if len(arrival.payload) > MAX_COMMAND_BYTES:
+        raise DecodeError("too_big", f"{len(arrival.payload)} bytes are too many for a speed limit")
+    message = _limits.decode(arrival.encoding, arrival.payload)
+    value = message.speed_limit
+    if not math.isfinite(value):
+        raise DecodeError("not_finite", "the speed limit is NaN or infinity; send 0.0 to lift it")
+    if value < 0.0 or (message.percentage and value > 100.0):
+        unit = " %" if message.percentage else " m/s"
+        most = " to 100 %" if message.percentage else " m/s or more"
+        raise DecodeError("out_of_range", f"{value:g}{unit}: send 0{most}; 0 lifts the limit")
+    by = f"{caller_name(arrival.via, arrival.attachment, arrival.sender)} on the key {SPEED_LIMIT}"
+    if value == 0.0:
+        return SpeedCap(None, by)
+    return SpeedCap(value / 100.0 * configured if message.percentage else value, by)
 
 
 class Identity(Struct, frozen=True):

@@ -10,7 +10,6 @@ from collections.abc import Callable, Collection, Mapping
 
 from acsard.core.config.settings import DIAGNOSTICS_HZ, STATE_HZ, Config
 from acsard.core.messages.certificate_expiry import DAY_NS, expiry, first_expiry
-from acsard.core.messages.covariances import UNKNOWN_COVARIANCE, pose_covariance, twist_covariance
 from acsard.core.messages.diagnostics import diagnostics
 from acsard.core.messages.frames import (
     FeedbackTopic,
@@ -54,8 +53,10 @@ from acsard.core.values import (
     Instant,
     News,
     Ns,
+    PoseCovariance,
     Rad,
     Snapshot,
+    TwistVariances,
 )
 from acsard.core.values import Cause as LatchedCause
 from acsard.core.values import Spread as Measurements
@@ -70,6 +71,12 @@ UNKNOWN_STATUS, CHARGING, DISCHARGING, NOT_CHARGING = range(4)  # `Battery.power
 
 
 BATTERY_HZ = 1.0
+
+# Variance of an axis that wheels do not measure (m2, rad2, m2/s2 or rad2/s2). It is the largest
+# that RViz can draw and a filter can invert.
+UNMEASURED = 1e6
+
+UNKNOWN_COVARIANCE = [UNMEASURED if cell % 7 == 0 else 0.0 for cell in range(36)]
 
 
 NEVER_NS = -(1 << 62)
@@ -399,6 +406,32 @@ def _spread(spread: Measurements) -> Spread:
 
 def _twist(twist: BodyTwist) -> Twist:
     return Twist(Vector3(x=twist.linear), Vector3(z=twist.angular))
+
+
+def pose_covariance(p: PoseCovariance) -> list[float]:
+    """Return the 6x6 covariance of the pose in the frame odom, m2, m rad and rad2.
+
+    Its axes are x, y, z, roll, pitch and yaw, and the rotations are about axes through the robot
+    that are parallel to those of odom.
+    """
+    u = UNMEASURED
+    # fmt: off
+    return [
+        p.xx,    p.xy,   0.0,  0.0,  0.0,  p.xyaw,
+        p.xy,    p.yy,   0.0,  0.0,  0.0,  p.yyaw,
+        0.0,     0.0,    u,    0.0,  0.0,  0.0,
+        0.0,     0.0,    0.0,  u,    0.0,  0.0,
+        0.0,     0.0,    0.0,  0.0,  u,    0.0,
+        p.xyaw,  p.yyaw, 0.0,  0.0,  0.0,  p.yawyaw,
+    ]
+    # fmt: on
+
+
+def twist_covariance(v: TwistVariances) -> list[float]:
+    """Return the 6x6 covariance of the twist in the frame base_link, m2/s2 and rad2/s2."""
+    cells = [0.0] * 36
+    cells[::7] = (v.linear, v.lateral, UNMEASURED, UNMEASURED, UNMEASURED, v.angular)
+    return cells
 
 
 def from_yaw(yaw: Rad) -> Quaternion:
