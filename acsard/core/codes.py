@@ -63,7 +63,7 @@ FaultCode = Literal[
 ]  # fmt: skip
 
 # Trouble of a wheel that does not stop the robot.
-WheelCode = Literal["wheel_blocked", "wheel_slow", "wheel_fast", "wheel_stuck"]
+WheelCode = Literal["wheel_blocked", "wheel_slow", "wheel_fast"]
 
 StateCode = Literal[
     StopCode, FaultCode, LinkCode, WaitCode, "switched_off", "other_version", "shutting_down",
@@ -195,7 +195,8 @@ wheel_reversed
     has no direction), and the wheel's sign in mcu.wheels
 wheel_runaway
     {wheel} wheel does not obey its command: it rolls on, or too far {figures}:
-    -> check the motor driver and the encoder
+    -> check the motor driver, the encoder, and whether the firmware keeps the last speed of a wheel
+    that stops
 wheel_too_fast
     {wheel} wheel turns faster than the limiter allows {figures}:
     -> check the speed controller of the board
@@ -211,9 +212,6 @@ wheel_slow
 wheel_fast
     {wheel} wheel reaches {share} of its expected speed:
     -> check the speed controller of the board and feedback.response_time
-wheel_stuck
-    {wheel} wheel reports exactly {speed} rad/s without a command:
-    -> check its encoder, and whether the firmware keeps the last speed when a wheel stops
 guard_line_damaged
     the daemon's guard replaced a line for the board with zeros: the line is not complete, or does
     not have four wheel speeds

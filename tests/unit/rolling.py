@@ -30,7 +30,7 @@ RIGHT: dict[Kind, set[str]] = {
     "runaway": {"wheel_runaway"},
     "dead": {"wheel_blocked", "left out"},
     "stuck": {
-        "wheel_stuck", "wheel_runaway", "wheel_too_fast", "wheel_reversed", "wheel_blocked",
+        "wheel_runaway", "wheel_too_fast", "wheel_reversed", "wheel_blocked",
         "wheel_slow", "left out",
     },
     "swapped": {"wheels_swapped"},

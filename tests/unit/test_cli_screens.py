@@ -104,7 +104,7 @@ ROBOTS = {
     "no-speed": replace(READY, linear=None, battery=BatterySummary(24.56, None, None, "ok")),
     "warned": WARNED,
     "fault": replace(
-        STATE, mode="fault", code="wheel_stuck", reason="a wheel is stuck",
+        STATE, mode="fault", code="wheel_runaway", reason="a wheel is stuck",
         settings_differ="limits.linear_speed = 0.8, not 1.0",
     ),
     "pressed": replace(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 
 import pytest
 
@@ -89,7 +88,7 @@ class Bench:
         while speed > 0.0:
             speed = max(0.0, speed - 20.0 * PERIOD)
             self.run(max(speed, keeps), speed)
-        self.run(keeps, 0.0, 3.0)
+        self.run(keeps, 0.0, 4.0)
         return self
 
     @property
@@ -101,9 +100,9 @@ class Bench:
 
 
 @each("keeps", [0.4, 0.8, 1.6])
-def test_wheels_that_follow_a_stop_and_keep_their_last_speed_are_a_warning(keeps: float) -> None:
+def test_wheels_that_keep_their_last_speed_after_a_stop_roll_on(keeps: float) -> None:
     bench = Bench().driven(5.0).stopped(5.0, keeps)
-    assert (bench.faults, set(bench.events)) == ([], {"wheel_stuck"})
+    assert set(bench.faults) == {"wheel_runaway"}
 
 
 @each("counts", [16, 3200])
@@ -120,30 +119,13 @@ def test_a_robot_that_is_faster_than_its_limiter_for_a_second_is_a_fault(
     assert bench.faults[0] == "wheel_too_fast"
 
 
-@each(
-    ("bench", "reported", "command", "seconds", "events", "text"),
-    [
-        (Bench, 0.0, 10.0, 1.0, ["wheel_blocked"] * 4, "front_left wheel is blocked, or has no"),
-        (
-            lambda: Bench().driven(1.08), 1.08, 0.0, 2.5, ["wheel_stuck"] * 4,
-            "rear_left wheel reports exactly 1.08 rad/s without a command",
-        ),
-    ],
-)  # fmt: skip
-def test_what_may_be_the_encoder_is_a_warning_until_it_ends(
-    bench: Callable[[], Bench],
-    reported: float,
-    command: float,
-    seconds: float,
-    events: list[str],
-    text: str,
-) -> None:
-    made = bench()
-    made.run(reported, command, seconds)
-    assert (made.faults, made.events) == ([], events)
-    assert text in made.text
-    made.run(command, command, 1.5)
-    assert made.text == ""
+def test_blocked_wheels_are_a_warning_until_they_turn() -> None:
+    bench = Bench()
+    bench.run(0.0, 10.0, 1.0)
+    assert (bench.faults, bench.events) == ([], ["wheel_blocked"] * 4)
+    assert "front_left wheel is blocked, or has no" in bench.text
+    bench.run(10.0, 10.0, 1.5)
+    assert bench.text == ""
 
 
 def test_wheels_that_rested_and_are_then_turned_are_reported_and_never_a_fault() -> None:

@@ -61,7 +61,6 @@ TOO_FAST, TOO_FAST_S, TOO_FAST_ANGLE, TOO_FAST_COUNTS = 1.2, 1.0, 0.3, 1.5
 PACE_S = 1.5  # faster or slower by `AGREEMENT`, until this is a warning: 2 s with the smoothing
 ROUNDING = 0.006  # rad/s, of a reported speed
 JITTER_S = 0.004  # of the times of lines
-HELD_S = 2.0  # for which a wheel repeats one speed at rest, until this is a warning
 # For which a wheel reports one speed, until its encoder may be stuck, and is although the other
 # wheel of its side differs little.
 SAME_S, PROVEN_S = 0.1, 1.0
@@ -128,7 +127,6 @@ class Wheel(Struct):
     pace_angle: Rad = 0.0
     reported: RadPerS = 0.0  # in the last line
     same_s: Seconds = 0.0  # for which it repeats this speed
-    ignored_s: Seconds = 0.0  # for which the command fell meanwhile; inf: it grew after the stop
     warning: Code | None = None
 
 
@@ -327,21 +325,15 @@ class Wheels(Struct):
             slack = ROUNDING * s + JITTER_S * abs(speeds[i])
             if speeds[i] == wheel.reported != 0.0 and abs(angle - speeds[i] * s) < slack:
                 wheel.same_s += s
-                if not still and abs(command) < (1.0 - AGREEMENT) * abs(speeds[i]):
-                    wheel.ignored_s += s
             else:
-                grew = still and abs(speeds[i]) > abs(wheel.reported)
-                wheel.same_s, wheel.ignored_s = 0.0, math.inf if grew else 0.0
-                wheel.reported = speeds[i]
+                wheel.same_s, wheel.reported = 0.0, speeds[i]
             if wheel.rested and abs(wheel.off) >= limit:
                 fastest, wheel.off = max(fastest, abs(wheel.speed)), 0.0
             if not wheel.rested:
                 self._pace(i, wheel, due[k], block)
                 if not wheel.agrees and abs(wheel.off) >= limit and wheel.apart_s >= patience:
                     self._disobeys(i, wheel, angle, block.unit)
-            if still and wheel.same_s >= HELD_S and wheel.apart_s >= HELD_S:
-                self._warn(i, wheel, "wheel_stuck")
-            elif wheel.warning and _obeys_again(wheel):
+            if wheel.warning and wheel.agrees and not still and wheel.pace_s == 0.0:
                 self._warn(i, wheel, None)
         self.unreported_s += s
         if fastest and self.unreported_s >= REPEATED_S:
@@ -384,12 +376,8 @@ class Wheels(Struct):
         goes_on = angle * off > 0.0 and speed * off > 0.0
         beyond = abs(wheel.apart_angle)
         if goes_on and abs(command) < COMMANDED:
-            # A firmware that waits for the next count keeps the last speed of a wheel that stops:
-            # it followed the command until the last two counts, and never changes after them.
-            kept = wheel.ignored_s <= max(MAX_BLOCK_S, 2 * count / abs(speed))
             # A sound wheel comes to rest before it has rolled this far without an approach.
-            far = beyond >= max(FAULT_ANGLE, FAULT_COUNTS * count)
-            if far and not (kept and wheel.same_s >= wheel.apart_s):
+            if beyond >= max(FAULT_ANGLE, FAULT_COUNTS * count):
                 self._latch("wheel_runaway", i, command)
         elif goes_on and off * command > 0.0:
             # A sound wheel is at its command before its smoothed speed, the mean of some counts.
@@ -622,12 +610,6 @@ def _rest(wheel: Wheel, angle: Rad, block: Block) -> None:
         wheel.rested, wheel.rest_s, wheel.rest_angle, wheel.off = True, 0.0, 0.0, 0.0
 
 
-def _obeys_again(wheel: Wheel) -> bool:
-    if wheel.warning == "wheel_stuck":
-        return wheel.same_s == 0.0
-    return wheel.agrees and abs(wheel.command) >= COMMANDED and wheel.pace_s == 0.0
-
-
 def _partners(side: Side, front: Rad, rear: Rad, keep: float, count: Rad) -> bool:
     side.apart = keep * (side.apart + front - rear)
     side.net = keep * (side.net + (front + rear) / 2)
@@ -684,5 +666,4 @@ def _slip_text(name: SideName) -> str:
 def _text(wheel: Wheel, i: int) -> str:
     assert wheel.warning is not None
     share = wheel.speed / wheel.due if wheel.due else 0.0
-    speed = f"{wheel.reported:.2f}"
-    return joined(reason(wheel.warning, wheel=WHEELS[i], speed=speed, share=f"{share:.0%}")).text
+    return joined(reason(wheel.warning, wheel=WHEELS[i], share=f"{share:.0%}")).text
