@@ -56,6 +56,7 @@ SAFETY = (
     "acsard/core/motion/lifecycle.py",
     "acsard/core/motion/modes.py",
     "acsard/core/motion/sanity.py",
+    "acsard/core/motion/sides.py",
     "acsard/core/motion/wheels.py",
     "acsard/core/motion/latches.py",
 )

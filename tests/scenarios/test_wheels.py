@@ -9,11 +9,11 @@ import pytest
 
 from acsard.core.config.contradictions import MOST_ASKED_HZ
 from acsard.core.config.settings import Config, ControlConfig, McuConfig, SimConfig
+from acsard.core.motion.sides import FAULT_RESPONSES
 from acsard.core.motion.wheels import (
     BLOCK_S,
     FAULT_ANGLE,
     FAULT_COUNTS,
-    FAULT_RESPONSES,
     count_angle,
 )
 from acsard.core.simulator.faults import Fault

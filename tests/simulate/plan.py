@@ -355,7 +355,7 @@ def _make_extreme(dice: random.Random, config: dict[str, Any]) -> None:
     A board that is asked more than 111 times a second gets a link that carries its counts.
     """
     rate, period = dice.choice(
-        ((10.0, 0.1), (200.0, 0.005), (300.0, 0.0034), ("auto", 0.01), (100.0, 0.01))
+        ((10.0, 0.1), (110.0, 0.0091), (300.0, 0.0034), ("auto", 0.01), (100.0, 0.01))
     )
     config["control"]["rate"] = rate
     if period < 0.01 and config["sim"].get("encoder_counts") == 96:

@@ -1,18 +1,15 @@
-"""Decides whether each wheel obeys its command, and which wheels the pose uses.
+"""Decides whether each wheel obeys its command.
 
 The expected speed is the command behind a lag of `feedback.response_time`. Measured minus expected
 is summed to an angle (`Wheel.off`), which leaks only while both agree. Beyond 1 rad and 3 counts, a
 wheel that came no nearer to its command for three response times does not obey it: a fault if it
-rolls on, too far or the wrong way, else a warning. A wheel that contradicts the other wheel of its
-side, and also the command or the gyro, is left out of the pose until both agree for 2 s, and the
-pose gets back what this wheel falsified before. A line only adds its angles: all else runs on the
-sums of `BLOCK_S`.
+rolls on, too far or the wrong way, else a warning. `sides.py` compares the two wheels of a side. A
+line only adds its angles: all else runs on the sums of `BLOCK_S`.
 """
 
 from __future__ import annotations
 
 import math
-from typing import Literal, NamedTuple
 
 from msgspec import Struct
 
@@ -21,6 +18,17 @@ from acsard.core.config.settings import FeedbackConfig
 from acsard.core.link.codec import Motors
 from acsard.core.motion.gaps import times
 from acsard.core.motion.kinematics import Kinematics
+from acsard.core.motion.sides import (
+    AGREEMENT,
+    FAULT_RESPONSES,
+    OUT_ANGLE,
+    OUT_COUNTS,
+    PARTNER_S,
+    PARTNER_S_PER_RAD,
+    Block,
+    Side,
+    SideName,
+)
 from acsard.core.values import (
     STILL,
     WHEELS,
@@ -32,15 +40,10 @@ from acsard.core.values import (
     WheelsStatus,
 )
 
-SideName = Literal["left", "right"]
-
 BLOCK_S = 0.05
 MAX_BLOCK_S = 0.1  # the longest time for which one line is evidence: it may cover a stall
 
 FAULT_ANGLE, FAULT_COUNTS = 1.0, 3.0  # rad and counts, both of them
-FAULT_RESPONSES = 3.0  # response times without an approach
-
-AGREEMENT = 0.3  # fraction of the larger of two speeds
 IDLE = 0.06  # counts per second of a smoothed speed that may be the rest of one count
 LEAK_S = 2.0
 # Largest fractions of the evidence for a fault that are kept: while both agree, and at all, because
@@ -61,22 +64,8 @@ TOO_FAST, TOO_FAST_S, TOO_FAST_ANGLE, TOO_FAST_COUNTS = 1.2, 1.0, 0.3, 1.5
 PACE_S = 1.5  # faster or slower by `AGREEMENT`, until this is a warning: 2 s with the smoothing
 ROUNDING = 0.006  # rad/s, of a reported speed
 JITTER_S = 0.004  # of the times of lines
-# For which a wheel reports one speed, until its encoder may be stuck, and is although the other
-# wheel of its side differs little.
-SAME_S, PROVEN_S = 0.1, 1.0
 
 COMMANDED = 0.005  # rad/s: a line to the board shows a lower one as 0.00
-
-# The wheels of a side contradict each other if their sums differ by more than this fraction, counts
-# and rad. They slip if they also differ by more than a motor that reacts later (s) explains. The
-# time constant of these sums is in s, and s for each rad of a count.
-PARTNER_FRACTION, PARTNER_COUNTS, PARTNER_ANGLE, PARTNER_DELAY_S = 0.05, 1.2, 0.002, 0.03
-PARTNER_S, PARTNER_S_PER_RAD = 0.14, 5.0
-OUT_COUNTS, OUT_ANGLE = 3.5, 0.05  # by which they must differ until one is left out
-OUT_BLOCKS = 2
-TURNING = 4.0  # ratio of command and expected speed above which the wheels turn around
-AGAIN_S = 2.0  # of agreement, until the pose uses a wheel again
-SLIP_S, SLIP_REPORTED_S = 0.5, 0.1  # after the last contradiction, and after the first one
 
 REPEATED_S = 1.0  # between two reports of motion without a command
 
@@ -85,24 +74,9 @@ SWAPPED_FRACTION = 0.2  # of the commands: by how much those of the sides must d
 # Encoder counts per turn if they are not configured: the least that acsard supports.
 ASSUMED_COUNTS = 16
 
-SIDES: tuple[tuple[SideName, int, int], ...]
-SIDES = ("left", 1, 2), ("right", 0, 3)  # with their front and rear wheel, by `WHEELS`
 SIDE_OF, ACROSS = (1, 0, 0, 1), (1, 0, 3, 2)  # each wheel's side, and wheel on the other one
 
 NOTHING: Motors = (0.0, 0.0, 0.0, 0.0)
-
-
-class Block(NamedTuple):
-    """The sums of some lines, and the bounds for them."""
-
-    s: Seconds
-    angles: Motors
-    line: Motors  # the angles of the last line
-    speeds: Motors  # in it
-    unit: Rad  # of an encoder count
-    limit: Rad  # evidence of a fault
-    patience: Seconds  # without an approach
-    rest: Seconds  # without motion or a command, after which a wheel rests
 
 
 class Wheel(Struct):
@@ -128,31 +102,6 @@ class Wheel(Struct):
     reported: RadPerS = 0.0  # in the last line
     same_s: Seconds = 0.0  # for which it repeats this speed
     warning: Code | None = None
-
-
-class Side(Struct):
-    """The front and rear wheel of a side, which have one command."""
-
-    command: RadPerS = 0.0
-    expected: RadPerS = 0.0
-    peak: RadPerS = 0.0  # of the commands in the last three response times, at least
-    next_peak: RadPerS = 0.0
-    peak_s: Seconds = 0.0  # since `peak` began
-    apart: Rad = 0.0  # recent sum of front minus rear
-    rolled: Rad = 0.0  # recent sum of the magnitudes
-    net: Rad = 0.0  # recent sum of the mean
-    why: str = ""  # the sign of a faulty encoder that one wheel shows
-    suspect: int = -1  # this wheel, by `WHEELS`; -1: it may be either
-    before: Rad = 0.0  # front minus rear in the block before the first one with this sign
-    votes: int = 0  # blocks with this sign, with the angles in them
-    front: Rad = 0.0
-    rear: Rad = 0.0
-    low: Rad = 0.0  # bounds of what a healthy wheel rolled meanwhile
-    high: Rad = 0.0
-    out: int = -1  # wheel that the pose leaves out
-    good_s: Seconds = 0.0
-    slip_s: Seconds = 0.0  # until the slip counts as ended
-    slipped_s: Seconds = 0.0
 
 
 class Wheels(Struct):
@@ -236,9 +185,9 @@ class Wheels(Struct):
         if not self.leaves_out:
             return wheels
         values = list(wheels)
-        for side, (_, front, rear) in zip(self.sides, SIDES, strict=True):
+        for side in self.sides:
             if side.out >= 0:
-                values[side.out] = wheels[front + rear - side.out]
+                values[side.out] = wheels[side.front + side.rear - side.out]
         return _motors(values)
 
     def possible_motion(self, wheels: Motors) -> list[tuple[SideName, Motors]]:
@@ -250,24 +199,22 @@ class Wheels(Struct):
         if not (self.leaves_out or self.missed):
             return []
         found, self.missed = list(self.missed), ()
-        for side, (name, front, rear) in zip(self.sides, SIDES, strict=True):
-            if side.out >= 0 and side.why != "repeats":
+        for side in self.sides:
+            out, other = side.out, side.front + side.rear - side.out
+            if out >= 0 and side.why != "repeats":
                 values = [0.0] * 4
-                values[side.out] = (
-                    wheels[side.out] - wheels[front + rear - side.out] - self.repair[side.out]
-                )
-                found.append((name, _motors(values)))
+                values[out] = wheels[out] - wheels[other] - self.repair[out]
+                found.append((side.name, _motors(values)))
         return found
 
     @property
     def status(self) -> WheelsStatus:
         out = [side for side in self.sides if side.out >= 0]
-        slipping = tuple(
-            name for side, (name, _, _) in zip(self.sides, SIDES, strict=True) if side.slip_s
-        )
-        texts = [_out_text(side) for side in out] + [_slip_text(name) for name in slipping]
+        slipping = [side for side in self.sides if side.slip_s]
+        texts = [side.out_text for side in out] + [side.slip_text for side in slipping]
         texts += [_text(wheel, i) for i, wheel in enumerate(self.wheels) if wheel.warning]
-        return WheelsStatus("; ".join(texts), tuple(WHEELS[side.out] for side in out), slipping)
+        left_out, names = [WHEELS[side.out] for side in out], [side.name for side in slipping]
+        return WheelsStatus("; ".join(texts), tuple(left_out), tuple(names))
 
     def _begin(self) -> None:
         self.angles, self.seconds, self.lines, self.turn, self.by_gyro = NOTHING, 0.0, 0, 0.0, True
@@ -296,11 +243,11 @@ class Wheels(Struct):
                 _rest(wheel, angle, block)
         else:
             left, right = self.sides
-            due_left = _expect(left, commanded.front_left, s, lag)
-            due_right = _expect(right, commanded.front_right, s, lag)
+            due_left = left.expect(commanded.front_left, s, lag)
+            due_right = right.expect(commanded.front_right, s, lag)
             if self.begins or self.late:
-                for side, (_, front, rear) in zip(self.sides, SIDES, strict=True):
-                    speed = max(angles[front], angles[rear], key=abs) / s
+                for side in self.sides:
+                    speed = max(angles[side.front], angles[side.rear], key=abs) / s
                     side.expected = speed if self.begins else _nearer(side.expected, speed)
                 self.begins = False
             if not self.late:
@@ -427,139 +374,53 @@ class Wheels(Struct):
         self.events = (*self.events, event)
 
     def _miss(self, count: Rad, patience: Seconds) -> None:
-        for side, (name, front, rear) in zip(self.sides, SIDES, strict=True):
-            one, other = self.wheels[front], self.wheels[rear]
+        for side in self.sides:
+            one, other = self.wheels[side.front], self.wheels[side.rear]
             # Quick motors stop before they are expected to.
             still = -COMMANDED < side.command < COMMANDED
             if side.out >= 0 or still or min(abs(one.missed), abs(other.missed)) <= count:
                 continue
             if one.apart_s >= patience and other.apart_s >= patience:
                 values = [0.0] * 4
-                values[front], values[rear] = one.missed, other.missed
+                values[side.front], values[side.rear] = one.missed, other.missed
                 one.missed = other.missed = 0.0
-                self.missed = (*self.missed, (name, _motors(values)))
+                self.missed = (*self.missed, (side.name, _motors(values)))
 
     def _compare(self, block: Block, kinematics: Kinematics) -> None:
         s, angles, count = block.s, block.angles, block.unit
         keep = 1.0 / (1.0 + s / (PARTNER_S + PARTNER_S_PER_RAD * count))
         left, right = self.sides
         agree = (
-            _partners(left, angles[1], angles[2], keep, count),
-            _partners(right, angles[0], angles[3], keep, count),
+            left.agrees(angles[1], angles[2], keep, count),
+            right.agrees(angles[0], angles[3], keep, count),
         )
         if agree == (True, True) and not self.slips:
             return
+        means = (angles[1] + angles[2]) / 2, (angles[0] + angles[3]) / 2
         for k, side in enumerate(self.sides):
-            side.slip_s = max(0.0, side.slip_s - s)
-            if not side.slip_s:
-                side.slipped_s = 0.0
-            if agree[k]:
-                self._agree(side, block)
-                continue
-            side.good_s = 0.0
-            if side.out >= 0:
-                continue
             low, high = sorted((side.command * s, side.expected * s))
             if self.by_gyro and agree[1 - k]:
-                means = (angles[1] + angles[2]) / 2, (angles[0] + angles[3]) / 2
                 low = high = kinematics.opposite(*means, self.turn)[k]
-            if not self._leave_out(k, side, low, high, block) and _slips(side, k, block):
-                before, side.slipped_s, side.slip_s = side.slipped_s, side.slipped_s + s, SLIP_S
-                if before < SLIP_REPORTED_S <= side.slipped_s:
-                    self._tell(_slip_text(SIDES[k][0]), "slip")
+            same_s = self.wheels[side.front].same_s, self.wheels[side.rear].same_s
+            before, event = side.out, side.judge(block, agree[k], low, high, same_s)
+            if before < 0 <= side.out:
+                repair = list(self.repair)
+                repair[side.out] = side.repair
+                self.repair = _motors(repair)
+            if event is not None:
+                self.events = (*self.events, event)
         self.leaves_out = left.out >= 0 or right.out >= 0
         self.slips = self.leaves_out or left.slip_s > 0.0 or right.slip_s > 0.0
 
-    def _agree(self, side: Side, block: Block) -> None:
-        if side.out < 0:
-            side.why, side.before = "", 0.0
-        elif side.rolled > OUT_COUNTS * block.unit + OUT_ANGLE:
-            side.good_s += block.s
-            if side.good_s >= AGAIN_S:
-                name, side.out = WHEELS[side.out], -1
-                text = (
-                    f"{name} wheel agrees with the other wheel of its side again: the pose uses it"
-                )
-                self.events = (*self.events, Event("wheel_fault", text, kind="again"))
-
-    def _leave_out(self, k: int, side: Side, low: Rad, high: Rad, block: Block) -> bool:
-        # A wheel is left out if it shows a sign of a faulty encoder, and is farther from what a
-        # healthy one rolls by a third of the difference.
-        if low * high <= 0.0 or max(low / high, high / low) > TURNING:
-            return False  # near rest, or while the direction changes, a healthy wheel may do both
-        _, front, rear = SIDES[k]
-        one, other = block.angles[front], block.angles[rear]
-        sign = _sign(side, one, other, block.unit)
-        if sign[0] == "still" and not one == other == 0.0:
-            sign = "still", front if abs(one) < abs(other) else rear
-        same = [i for i in (front, rear) if self.wheels[i].same_s >= SAME_S]
-        if len(same) == 1 and not sign[0]:
-            sign = "repeats", same[0]
-        if sign != (side.why, side.suspect):
-            side.why, side.suspect = sign
-            side.votes, side.front, side.rear, side.low, side.high = 0, 0.0, 0.0, 0.0, 0.0
-        if not side.why:
-            side.before = one - other
-            return False
-        side.votes += 1
-        side.front += one
-        side.rear += other
-        side.low += low
-        side.high += high
-        apart = abs(side.front - side.rear)
-        off_front = max(side.low - side.front, side.front - side.high, 0.0)
-        off_rear = max(side.low - side.rear, side.rear - side.high, 0.0)
-        out = front if off_front > off_rear else rear
-        if (
-            side.votes < OUT_BLOCKS
-            or apart < OUT_COUNTS * block.unit + OUT_ANGLE
-            or abs(off_front - off_rear) < apart / 3
-            or min(off_front, off_rear) > apart / 2
-            or side.suspect not in (-1, out)
-            # An even wheel may be right, and the other one slip.
-            or (
-                self.wheels[out].same_s < PROVEN_S
-                and side.why == "repeats"
-                and apart < AGREEMENT * max(abs(side.front), abs(side.rear))
-            )
-        ):
-            return False
-        side.out, side.slip_s = out, 0.0
-        # The pose has the last line right, and the lines before it wrong.
-        missed = side.rear - side.front - side.before - block.line[rear] + block.line[front]
-        repair = list(self.repair)
-        repair[out] = missed if out == front else -missed
-        self.repair = _motors(repair)
-        self._tell(_out_text(side), "left out")
-        return True
-
-    def _tell(self, text: str, kind: str) -> None:
-        self.events = (*self.events, Event("wheel_fault", text, "warning", kind=kind))
-
 
 def new_wheels() -> Wheels:
-    return Wheels((Wheel(), Wheel(), Wheel(), Wheel()), (Side(), Side()))
+    sides = Side("left", front=1, rear=2), Side("right", front=0, rear=3)
+    return Wheels((Wheel(), Wheel(), Wheel(), Wheel()), sides)
 
 
 def count_angle(counts: int) -> Rad:
     """Return the angle of an encoder count; `counts` per turn are 0 if they are unknown."""
     return math.tau / (counts or ASSUMED_COUNTS)
-
-
-def _expect(side: Side, command: RadPerS, s: Seconds, lag: Seconds) -> Rad:
-    # Exact for a command that is constant in the block; the mean of two is, in a ramp.
-    goal, side.command = (side.command + command) / 2, command
-    before, rest = side.expected - goal, math.exp(-s / lag)
-    side.expected = goal + before * rest
-    size = command if command > 0.0 else -command
-    side.peak_s += s
-    if side.peak_s >= FAULT_RESPONSES * lag:
-        side.peak, side.next_peak, side.peak_s = side.next_peak, size, 0.0
-    if size > side.next_peak:
-        side.next_peak = size
-    if size > side.peak:
-        side.peak = size
-    return goal * s + before * lag * (1.0 - rest)
 
 
 def _follow(wheel: Wheel, angle: Rad, due: Rad, block: Block) -> None:
@@ -610,34 +471,6 @@ def _rest(wheel: Wheel, angle: Rad, block: Block) -> None:
         wheel.rested, wheel.rest_s, wheel.rest_angle, wheel.off = True, 0.0, 0.0, 0.0
 
 
-def _partners(side: Side, front: Rad, rear: Rad, keep: float, count: Rad) -> bool:
-    side.apart = keep * (side.apart + front - rear)
-    side.net = keep * (side.net + (front + rear) / 2)
-    side.rolled = keep * (side.rolled + (abs(front) + abs(rear)) / 2)
-    return abs(side.apart) <= _allowed(side, count)
-
-
-def _allowed(side: Side, count: Rad) -> Rad:
-    return PARTNER_FRACTION * side.rolled + PARTNER_COUNTS * count + PARTNER_ANGLE
-
-
-def _slips(side: Side, k: int, block: Block) -> bool:
-    _, front, rear = SIDES[k]
-    speed = (block.angles[front] + block.angles[rear]) / 2 / block.s
-    mean = side.net / (PARTNER_S + PARTNER_S_PER_RAD * block.unit)
-    return abs(side.apart) > _allowed(side, block.unit) + PARTNER_DELAY_S * abs(speed - mean)
-
-
-def _sign(side: Side, one: Rad, other: Rad, count: Rad) -> tuple[str, int]:
-    # Of a faulty encoder. Between two counts, the last sign stays.
-    larger = max(abs(one), abs(other))
-    if one == other == 0.0 or (one * other == 0.0 and side.why == "against"):
-        return side.why, side.suspect
-    if one * other < 0.0 and abs(one + other) <= AGREEMENT * larger + OUT_COUNTS * count:
-        return "against", -1
-    return ("still" if min(abs(one), abs(other)) <= 0.1 * larger else ""), -1
-
-
 def _nearer(one: RadPerS, other: RadPerS) -> RadPerS:
     return min(one, other, key=abs) if one * other > 0.0 else 0.0
 
@@ -645,22 +478,6 @@ def _nearer(one: RadPerS, other: RadPerS) -> RadPerS:
 def _motors(values: list[float]) -> Motors:
     front_right, front_left, rear_left, rear_right = values
     return front_right, front_left, rear_left, rear_right
-
-
-OUT_TEXTS = {
-    "still": "reports no motion while the other wheel on its side turns",
-    "against": "reports a direction opposite to that of the other wheel on its side",
-    "repeats": "reports a speed that never changes",
-}
-
-
-def _out_text(side: Side) -> str:
-    name = WHEELS[side.out]
-    return f"{name} wheel is left out of the pose: it {OUT_TEXTS[side.why]}; check its encoder"
-
-
-def _slip_text(name: SideName) -> str:
-    return f"{name} wheels slip: front and rear turn differently"
 
 
 def _text(wheel: Wheel, i: int) -> str:
