@@ -54,9 +54,7 @@ def test_each_new_certificate_is_noticed_once(files: Files) -> None:
 
 
 @pytest.mark.parametrize("missing", ["certificate.pem", "key.pem"])
-def test_files_that_are_copied_one_by_one_count_when_all_are_present(
-    files: Files, missing: str
-) -> None:
+def test_files_copied_one_by_one_count_when_all_are_present(files: Files, missing: str) -> None:
     file = files.where / missing
     old = file.read_bytes()
     files.issue()

@@ -57,9 +57,7 @@ def granted(access: Any, subjects: set[str], message: str) -> set[str]:
 
 @each("role", ROLES)
 @each("message", ["query", "put"])
-def test_each_role_may_use_the_same_keys_as_at_the_gateway_of_a_robot(
-    role: Role, message: str
-) -> None:
+def test_each_role_may_use_the_same_keys_as_at_a_robot_s_gateway(role: Role, message: str) -> None:
     gateway = gateway_access(
         Config(
             robot=RobotConfig(id="robot1"),
@@ -140,9 +138,7 @@ def test_each_commanding_certificate_has_keys_of_its_own_on_each_robot(robots: l
         (["robot1"], {"viewer": ["anna"], "operator": ["anna"]}), (["operator"], {}),
     ],
 )  # fmt: skip
-def test_a_name_may_occur_only_once(
-    robots: list[str], people: Mapping[Role, Sequence[str]]
-) -> None:
+def test_a_name_may_occur_once(robots: list[str], people: Mapping[Role, Sequence[str]]) -> None:
     with pytest.raises(UsageError, match="occur more than once"):
         router_file(TEMPLATE, robots, people)
 

@@ -110,9 +110,7 @@ def test_a_token_that_expired_stays_expired_after_a_start_without_the_time(
     assert owner(server, other) is not None
 
 
-def test_without_the_time_a_token_is_valid_only_for_its_days_of_running(
-    tmp_path: Path, clocks: Clocks
-) -> None:
+def test_without_the_time_a_token_lasts_its_days_of_running(tmp_path: Path, clocks: Clocks) -> None:
     text, _ = Vault(tmp_path, "robot1").invite("maintainer", "me", 1)
     valid = list[bool]()
     for _ in range(3):  # starts, each of which runs for 10 hours and 1 minute

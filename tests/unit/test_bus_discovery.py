@@ -67,9 +67,7 @@ def test_the_arguments_win_over_the_environment_and_over_the_file_that_it_names(
 @pytest.mark.parametrize(
     ("text", "words"), [(None, "No such file"), ("[robot]\nidd = 1\n", "did you mean id?")]
 )
-def test_a_file_that_cannot_be_used_is_an_error_that_names_it(
-    named: Path, text: str | None, words: str
-) -> None:
+def test_an_unusable_file_is_named(named: Path, text: str | None, words: str) -> None:
     if text is None:
         named.unlink()
     else:
@@ -82,9 +80,7 @@ def test_a_file_that_cannot_be_used_is_an_error_that_names_it(
     assert address_by_environment(NOBODY, "r8", "")[:3] == (NOBODY, "r8", "")
 
 
-def test_a_client_that_cannot_open_its_session_names_its_router_and_no_address_to_listen_on() -> (
-    None
-):
+def test_a_client_without_a_session_names_its_router_and_no_address_to_listen_on() -> None:
     with pytest.raises(MendableError) as caught:
         daemon_session(Config(bus=BusConfig(mode="client", connect=("nonsense",))))
     assert not isinstance(caught.value, InUseError)

@@ -80,9 +80,7 @@ def command(payload: bytes, at_ns: int, key: str = "cmd/app") -> Arrival:
         (command(b"1", 50_000_000, "cmd/unlisted"), True),
     ],
 )
-def test_a_command_that_is_repeated_soon_waits_for_the_next_step(
-    after: Arrival, wakes: bool
-) -> None:
+def test_a_command_repeated_soon_waits_for_the_next_step(after: Arrival, wakes: bool) -> None:
     inbox, loop = an_inbox()
     for arrival in (command(b"1", 0), after):
         inbox._put(inbox._buffer(arrival.key), arrival)

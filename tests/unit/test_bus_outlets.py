@@ -100,7 +100,7 @@ class Bus:
 
 
 @pytest.mark.parametrize("feedback", [False, True])
-def test_while_the_bus_blocks_the_newest_messages_wait_and_the_others_are_counted(
+def test_while_the_bus_blocks_the_newest_messages_wait_and_others_count(
     feedback: bool,
 ) -> None:
     """If a client can block the bus, the control loop sends nothing itself."""

@@ -85,9 +85,7 @@ def served(asked: Query, made: Queries | None = None) -> Request | list[Reply]:
 
 @each("topic", [t for t in PUBLISHED if not t.simulated and t.key != BEAT])
 @each("form", FORMATS)
-def test_a_published_key_answers_with_its_last_value_in_the_asked_format(
-    topic: Any, form: Format
-) -> None:
+def test_a_key_answers_with_its_last_value_in_the_asked_format(topic: Any, form: Format) -> None:
     value = last(topic.key)
     reply = answer(query(topic.key, fmt=form))
     try:
@@ -175,9 +173,7 @@ def test_an_unknown_type_has_no_schema(asked: str) -> None:
     [("nonsense", "nonsense"),
      *(("whoami/<role>", asked) for asked in ("whoami/*", "whoami/**", "**", "whoami/admin"))],
 )  # fmt: skip
-def test_an_unknown_key_or_role_and_a_wildcard_for_a_role_have_no_answer(
-    topic: str, asked: str
-) -> None:
+def test_an_unknown_key_or_role_or_a_wildcard_role_has_no_answer(topic: str, asked: str) -> None:
     assert answers(query(topic, asked)) == []
 
 
@@ -251,9 +247,7 @@ def test_a_service_runs_for_its_exact_key_only(verb: Any) -> None:
         ("x" * 999, f"'{'x' * 40}' is not a service of this robot; its services are "),
     ],
 )
-def test_a_service_that_this_daemon_does_not_have_is_refused_in_words(
-    verb: str, words: str
-) -> None:
+def test_a_service_that_the_daemon_lacks_is_refused_in_words(verb: str, words: str) -> None:
     reply = answer(query(f"srv/{verb}", payload=b"{}"))
     result = msgspec.json.decode(reply.payload, type=ServiceReply)
     assert (reply.key, reply.ok, result.success) == (f"srv/{verb}", True, False)

@@ -209,9 +209,7 @@ def test_the_clock_of_a_header_is_kept_apart_from_that_of_a_stamping_router() ->
 @pytest.mark.parametrize(
     ("ahead_ns", "replaced"), [(0, False), (500_000_000, False), (500_000_001, True)]
 )
-def test_a_stamp_more_than_half_a_second_ahead_counts_as_replaced_by_zenoh(
-    ahead_ns: int, replaced: bool
-) -> None:
+def test_a_stamp_half_a_second_ahead_counts_as_replaced(ahead_ns: int, replaced: bool) -> None:
     attachment = signed(stamp=SENT_NS + ahead_ns)
     result = RECEIVER.command(ours(twist(), attachment=attachment, received_ns=SENT_NS))
     assert (result.stamp_replaced, result.stamp_ns) == (replaced, SENT_NS + ahead_ns)
@@ -327,9 +325,7 @@ def test_a_signature_is_a_map_with_a_sender(form: Any) -> None:
         ("\u202elaptop", "?laptop"), ("Jürgen", "Jürgen"), ("x" * 50, "x" * MAX_NAME_LENGTH),
     ],
 )  # fmt: skip
-def test_a_public_name_has_no_secret_and_cannot_imitate_the_text_around_it(
-    name: str, public: str
-) -> None:
+def test_a_public_name_has_no_secret_and_imitates_no_text(name: str, public: str) -> None:
     digits = hashlib.sha256(f"{name}/s3cret".encode()).hexdigest()[:16]
     assert public_name(f"{name}/s3cret") == f"{public}/{digits}"
     for nameless in ("s3cret", "/s3cret", " /s3cret", "1f2e" * 8):

@@ -263,7 +263,7 @@ def test_a_reading_gives_the_turned_angles_whenever_the_host_reads_it(
         st.tuples(st.integers(1, 400), st.floats(-1.0, 1.0), st.floats(0.0, 300.0)), max_size=40
     )
 )
-def test_the_angles_add_up_to_all_counts_over_any_number_of_wraps(
+def test_the_angles_add_up_over_any_number_of_wraps(
     steps: list[tuple[int, float, float]],
 ) -> None:
     board, late_ms, total, clock = Board(), 0.0, [0.0] * 4, 0.0

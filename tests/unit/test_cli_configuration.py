@@ -116,7 +116,7 @@ def test_the_options_of_a_tool_win_over_the_configuration(places: Places) -> Non
     assert address_of(places.option, robot_id="r8") == ("tcp/127.0.0.1:7448", "r8", "")
 
 
-def test_a_certificate_goes_with_a_tls_endpoint_only(
+def test_a_certificate_needs_a_tls_endpoint(
     places: Places, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     places.option.write_text(

@@ -97,7 +97,7 @@ def test_a_number_of_messages_counts_for_each_robot(
     assert "".join(msgspec.json.decode(line)["robot"] for line in lines) == ids
 
 
-def test_a_robot_that_publishes_does_not_hide_the_silence_of_another(
+def test_one_robot_does_not_hide_the_silence_of_another(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     assert printed("ab", "aaab", 1, timeout=-1.0) == 1

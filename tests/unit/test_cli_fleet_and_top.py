@@ -90,9 +90,7 @@ def test_robots_beyond_the_limit_are_reported_as_left_out(session: Session) -> N
     assert "--id" in fleet.left_out_text
 
 
-def test_the_robot_that_is_gone_for_longest_makes_room_for_a_new_one(
-    session: Session, clock: Clock
-) -> None:
+def test_the_robot_gone_longest_makes_room_for_a_new_one(session: Session, clock: Clock) -> None:
     fleet = fleet_of(session, ("robot0", "*"))
     for number in range(3):
         session.announce(f"robot{number}")
@@ -156,9 +154,7 @@ def line_after(fleet: Roster, clock: Clock, seconds: float) -> str:
     return drawn(table(fleet.rows(), 120), 120).splitlines()[1].rstrip()
 
 
-def test_a_daemon_that_hangs_is_silent_though_a_storage_answers_for_it(
-    session: Session, clock: Clock
-) -> None:
+def test_a_hung_daemon_is_silent_though_a_storage_answers(session: Session, clock: Clock) -> None:
     robot: Any = Remembers(session)
     fleet = Roster(robot, ("robot1",))
     session.announce("robot1")

@@ -237,7 +237,7 @@ def test_an_unknown_key_is_reported_as_the_only_reason(session: Session, name: s
     assert "daemon" not in message
 
 
-def test_a_service_call_above_the_size_limit_is_refused_at_once_in_the_daemon_s_words(
+def test_a_call_above_the_size_limit_is_refused_in_the_daemon_s_words(
     session: Session,
 ) -> None:
     """The bus does not carry a much larger payload, so the daemon could not refuse it."""

@@ -267,9 +267,7 @@ def test_a_drive_ends_after_the_program_stalled_or_the_bus_accepted_no_command(
         ("stalls", 1.5, 4.0),  # it only waits for the robot to stop
     ],
 )
-def test_a_drive_outlasts_a_pause_that_does_not_matter(
-    trouble: str, begins: float, lasts: float
-) -> None:
+def test_a_drive_outlasts_a_harmless_pause(trouble: str, begins: float, lasts: float) -> None:
     world = World(followed)
     setattr(world, trouble, (begins, lasts))
     assert world.drive() < 2.1 + lasts
@@ -278,9 +276,7 @@ def test_a_drive_outlasts_a_pause_that_does_not_matter(
 
 @each("seconds", [0.4, 1.0, 60.0])
 @each("dies", [0.35, 0.7, 1.0])
-def test_a_stored_state_of_a_dead_robot_does_not_keep_a_drive_running(
-    seconds: float, dies: float
-) -> None:
+def test_a_stored_state_of_a_dead_robot_keeps_no_drive_running(seconds: float, dies: float) -> None:
     """A router's storage answers queries with the last state of a robot that is off."""
     world = World(followed)
     world.dies = dies

@@ -121,9 +121,7 @@ UNREADABLE = raw_sample(b"{}")
 
 
 @pytest.mark.parametrize(("answer", "expected"), [(2, [3]), (3, [2, 3])])
-def test_published_states_and_answers_come_in_the_order_of_their_stamps(
-    answer: int, expected: list[int]
-) -> None:
+def test_states_and_answers_come_in_order_of_their_stamps(answer: int, expected: list[int]) -> None:
     robot = Robot()
     watch = Watch(robot, 0.0)
     robot.queue.append(sample_of(at(1)))

@@ -71,7 +71,7 @@ def test_a_silent_robot_leads_to_questions_first_about_the_id_and_to_no_claim() 
 NOBODY_LISTENS = "tls/127.0.0.1:1"
 
 
-def test_a_directory_without_certificates_is_reported_and_not_taken_for_a_missing_daemon(
+def test_a_directory_without_certificates_is_not_taken_for_a_missing_daemon(
     tmp_path: Path,
 ) -> None:
     with (

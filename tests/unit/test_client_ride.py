@@ -126,7 +126,7 @@ def is_over_after(state: RobotState, seconds: float) -> bool:
         with_age(replace(MOVING, mode="stopped"), None),
     ],
 )
-def test_zeros_end_if_a_state_shows_that_the_sender_has_stopped_the_robot(
+def test_zeros_end_if_a_state_shows_that_the_sender_stopped_the_robot(
     state: RobotState,
 ) -> None:
     assert is_over_after(state, SETTLED_S + 0.05)
@@ -150,7 +150,7 @@ def test_zeros_go_on_while_no_state_shows_that_they_arrived(state: RobotState) -
 
 
 @each("state", [MOVING, replace(RESTING, linear=None, angular=None)])
-def test_zeros_end_if_something_else_moves_the_robot_or_its_speed_is_unknown(
+def test_zeros_end_if_another_moves_the_robot_or_its_speed_is_unknown(
     state: RobotState,
 ) -> None:
     rider = Rider(MOVING)

@@ -38,9 +38,7 @@ def types(method: Callable[..., object]) -> dict[str, object]:
         (AsyncReads.messages, FOLLOWED_KEYS),
     ],
 )
-def test_each_key_of_the_table_gives_its_own_type(
-    method: Callable[..., object], keys: set[str]
-) -> None:
+def test_each_key_has_its_own_type(method: Callable[..., object], keys: set[str]) -> None:
     def wanted(key: str) -> object:
         topic = by_key(key)
         assert topic is not None

@@ -113,7 +113,7 @@ Moves = list[tuple[float, float, float]]
 
 @law
 @given(path=moves)
-def test_the_covariance_is_positive_and_moving_never_makes_the_pose_more_certain(
+def test_the_covariance_is_positive_and_motion_makes_no_pose_more_certain(
     path: Moves,
 ) -> None:
     moved, gaps = Odometer(), Odometer()

@@ -98,9 +98,7 @@ DRIVES = SCENARIOS | {"minute": lambda rng: random(rng, 60.0)}
 @pytest.mark.soak
 @pytest.mark.parametrize("counts", [20, 96, 400, 3200])
 @pytest.mark.parametrize("scenario", ["square", "minute", "circle"])
-def test_the_covariance_matches_the_pose_errors_of_coarse_encoders(
-    scenario: str, counts: int
-) -> None:
+def test_the_covariance_matches_the_errors_of_coarse_encoders(scenario: str, counts: int) -> None:
     values = study(
         DRIVES[scenario], DEFAULT, 1000, drives=40, heard=counting(counts), counts=counts
     )

@@ -134,9 +134,7 @@ def test_a_question_passes_in_every_state_and_changes_no_speed() -> None:
 
 @each("letters", [b"", b"S"])
 @each("comma", [False, True])
-def test_a_checksum_must_be_right_and_a_checked_link_requires_it(
-    comma: bool, letters: bytes
-) -> None:
+def test_a_checksum_must_be_right_and_a_checked_link_needs_it(comma: bool, letters: bytes) -> None:
     stop = COMMA_STOP if comma else STOP
     codec = Codec(WheelMap(), comma)
     for sequence in (0, 7, 255):
@@ -159,9 +157,7 @@ def test_a_checksum_must_be_right_and_a_checked_link_requires_it(
     ("suffix", "letters"),
     [(b"#07", b"Z"), (b"#07", b"SS"), (b"#0", b""), (b"#007", b""), (b"#0a", b""), (b",#07", b"")],
 )
-def test_an_unknown_suffix_is_refused_even_with_a_right_checksum(
-    suffix: bytes, letters: bytes
-) -> None:
+def test_an_unknown_suffix_is_refused_with_a_right_checksum(suffix: bytes, letters: bytes) -> None:
     body = line(1.0)[:-2] + suffix + letters
     closed = b"%b*%04X\r\n" % (body, binascii.crc_hqx(body, 0))
     assert Guarded().check(closed) == DAMAGED
@@ -259,9 +255,7 @@ def clocked() -> Guarded:
         (LimitsConfig(linear_speed=0.0, angular_speed=50.0, wheel_speed=10.0), 833),
     ],
 )
-def test_the_longest_ramp_equals_the_time_calculated_by_hand(
-    limits: LimitsConfig, ramp_ms: int
-) -> None:
+def test_the_longest_ramp_is_the_one_worked_by_hand(limits: LimitsConfig, ramp_ms: int) -> None:
     assert Guard(STOP, Config(limits=limits)).memory.ramp_ns // MS == ramp_ms
     if limits.linear_speed == 0.0:  # a wider track turns more slowly
         wide = Config(limits=limits, drive=DriveConfig(wheel_separation_multiplier=2.0))
@@ -275,9 +269,7 @@ def test_the_longest_ramp_equals_the_time_calculated_by_hand(
         ("stopped", 500), ("fault", 500), ("shutdown", 500),
     ],
 )  # fmt: skip
-def test_without_a_fresh_command_only_zero_passes_after_the_longest_ramp(
-    mode: str, ramp_ms: float
-) -> None:
+def test_without_a_command_only_zero_passes_after_the_ramp(mode: str, ramp_ms: float) -> None:
     last_ms = ramp_ms + RAMP_MARGIN_NS / MS
     guarded = clocked()
     assert guarded.at(0, mode) == guarded.at(last_ms, mode) == ""

@@ -49,9 +49,7 @@ def test_each_key_drives_in_its_direction_for_its_hold(key: str, linear: int, an
 
 
 @each(("delay", "hz"), [(0.25, 30.0), (0.5, 30.0), (0.5, 10.9), (0.25, 5.0)])
-def test_a_held_key_drives_without_a_break_and_stops_soon_after_its_release(
-    delay: float, hz: float
-) -> None:
+def test_a_held_key_drives_on_and_stops_soon_after_its_release(delay: float, hz: float) -> None:
     keys, last = pressed("i", 10.0), 10.0
     for at in [10.0 + delay + n / hz for n in range(30)]:
         assert keys.wish(at - 0.001) == Twist(0.5, 0.0)
@@ -69,9 +67,7 @@ def test_any_other_key_stops_immediately(key: str) -> None:
 
 
 @each(("key", "linear", "angular"), SPEEDS)
-def test_speed_keys_change_ten_percent_and_do_not_move(
-    key: str, linear: float, angular: float
-) -> None:
+def test_speed_keys_change_a_tenth_and_do_not_move(key: str, linear: float, angular: float) -> None:
     keys = pressed(key, 10.0)
     assert (keys.linear, keys.angular) == pytest.approx((0.5 * linear, 2.0 * angular))
     assert keys.wish(10.0) is None

@@ -197,9 +197,7 @@ def test_a_delayed_space_does_not_release_a_key_that_no_longer_drives() -> None:
 
 
 @each(("key", "seconds"), [(" ", 0.05), ("k", 0.05), ("", REPEAT_S + RELEASE_TIMEOUT_S + 0.1)])
-def test_a_key_that_no_longer_drives_does_so_after_a_stop_or_its_release(
-    key: str, seconds: float
-) -> None:
+def test_a_key_drives_again_after_a_stop_or_its_release(key: str, seconds: float) -> None:
     drive = held(ZERO_FIRST)
     drive.step("i", times=10)
     drive.robot.shows = FOLLOWED

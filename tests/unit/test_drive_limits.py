@@ -127,9 +127,7 @@ NO_TURN, NO_DRIVE = LimitsConfig(angular_speed=0.0), LimitsConfig(linear_speed=0
         (LimitsConfig(wheel_speed=16.0), (1.0, 4.0), (0.5, 2.0)),
     ],
 )
-def test_a_twist_beyond_the_limits_is_scaled_as_a_whole(
-    limits: LimitsConfig, wish: Pair, end: Pair
-) -> None:
+def test_a_twist_beyond_limits_is_scaled_whole(limits: LimitsConfig, wish: Pair, end: Pair) -> None:
     assert pair(Ramp(limits).follow(Twist(*wish), 1000.0)) == near(*end)
 
 
@@ -174,9 +172,7 @@ def test_each_axis_changes_by_no_more_than_its_limit_and_no_wheel_is_too_fast(
 
 @law
 @given(wish=twists, start=twists, dt=periods)
-def test_a_goal_within_the_limits_is_reached_exactly_and_held(
-    wish: Twist, start: Twist, dt: float
-) -> None:
+def test_a_goal_within_limits_is_reached_and_held(wish: Twist, start: Twist, dt: float) -> None:
     ramp = Ramp()
     ramp.follow(start, 1000.0)
     ramp.path(wish, int(2.1 / dt) + 2, dt)
@@ -244,7 +240,7 @@ def test_coasting_worked_by_hand() -> None:
 
 @law
 @given(start=twists, dt=periods, stop=st.booleans())
-def test_coasting_ends_at_rest_in_its_time_and_makes_no_wheel_faster(
+def test_coasting_ends_in_time_and_no_wheel_gets_faster(
     start: Twist, dt: float, stop: bool
 ) -> None:
     ramp, by, steps = Ramp(), 3.0 if stop else 1.0, 0
@@ -304,7 +300,7 @@ def rising(speeds: list[float]) -> list[Pair]:
 
 @law
 @given(wishes=st.lists(st.tuples(mixed, st.integers(1, 40)), max_size=8))
-def test_jerk_bounds_how_much_steeper_a_slope_gets_whatever_is_commanded(
+def test_jerk_bounds_how_much_steeper_a_slope_gets(
     wishes: list[tuple[Twist, int]],
 ) -> None:
     ramp, path = Ramp(JERKY), [REST]

@@ -107,7 +107,7 @@ def fail() -> None:
     raise UNREADABLE
 
 
-def test_the_daemon_logs_a_call_of_a_viewer_under_a_readable_name(
+def test_the_log_has_a_viewer_s_call_under_a_readable_name(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """The daemon replaces each comma in a name by a question mark."""
@@ -117,7 +117,7 @@ def test_the_daemon_logs_a_call_of_a_viewer_under_a_readable_name(
     assert name == "alice@laptop acsard foxglove"
 
 
-def test_a_daemon_whose_reply_cannot_be_read_is_queried_once_a_second_and_reported_once(
+def test_an_unreadable_daemon_is_queried_once_a_second_and_reported_once(
     world: World,
 ) -> None:
     world.daemon(zenoh.SampleKind.DELETE)
@@ -133,7 +133,7 @@ def test_a_daemon_whose_reply_cannot_be_read_is_queried_once_a_second_and_report
     assert world.server.shown[2:] == ["without daemon"]
 
 
-def test_the_configuration_is_read_again_if_the_daemon_restarts_while_it_is_queried(
+def test_the_configuration_is_read_again_if_the_daemon_restarts_meanwhile(
     world: World,
 ) -> None:
     def restart_once() -> None:

@@ -243,9 +243,7 @@ def test_wheels_that_spin_on_the_spot_are_not_believed(rate: float) -> None:
 
 
 @each(("factor", "does"), [(-1.0, "reversed"), (57.3, "in degrees")])
-def test_a_gyro_that_later_reports_another_quantity_must_prove_itself_again(
-    factor: float, does: str
-) -> None:
+def test_a_gyro_that_reports_another_quantity_must_prove_itself(factor: float, does: str) -> None:
     bench = Bench(noise=0.002).proved()
     bench.distort = lambda rate: factor * rate
     assert bench.run(3.0, 0.5).says == does

@@ -107,7 +107,7 @@ def proved(scale: float) -> Turning:
 
 
 @pytest.mark.parametrize("drives_on", [False, True])
-def test_the_heading_of_a_gyro_that_hangs_is_taken_back_or_in_the_covariance(
+def test_a_hanging_gyro_s_heading_is_taken_back_or_in_the_covariance(
     drives_on: bool,
 ) -> None:
     bench = proved(1.0)

@@ -113,7 +113,7 @@ STORIES = [
 
 
 @each("story", STORIES)
-def test_the_first_of_two_gyros_is_followed_until_it_is_silent(
+def test_the_first_of_two_gyros_counts_until_its_silence(
     story: list[tuple[int, str, str]],
 ) -> None:
     gyro, counters = GyroFollower(), Counter[str]()

@@ -78,9 +78,7 @@ def test_without_thresholds_or_reports_there_is_no_level_to_act_on() -> None:
         (21.0, "warning"), (20.99, "stop"), (0.0, "stop"),
     ],
 )  # fmt: skip
-def test_a_steady_voltage_has_its_level_after_three_seconds(
-    volts: float, level: BatteryLevel
-) -> None:
+def test_a_steady_voltage_has_its_level_after_3_s(volts: float, level: BatteryLevel) -> None:
     pack = Pack()
     assert pack.at(volts, 3.0) == "unknown"
     assert pack.events == []

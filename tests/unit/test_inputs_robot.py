@@ -136,7 +136,7 @@ def replugged(rig: Rig, status: bytes, closed: int = 100) -> Rig:
 
 
 @each("line", [FAULT, PRESSED, FRONT, OK])
-def test_a_board_that_reports_no_inputs_does_not_inherit_those_of_the_previous_one(
+def test_a_board_without_inputs_does_not_inherit_those_of_the_previous_one(
     line: bytes,
 ) -> None:
     rig = replugged(Rig(status=line).linked(), b"")
@@ -174,7 +174,7 @@ def test_each_board_must_report_the_required_inputs_before_the_robot_is_ready() 
 
 
 @pytest.mark.parametrize("line", [PRESSED, OK + FAULT, REAR])
-def test_a_restarted_daemon_refuses_clear_until_the_board_has_reported_the_cause(
+def test_a_restarted_daemon_refuses_clear_until_the_board_reports_the_cause(
     line: bytes,
 ) -> None:
     latches = after_restart(Rig(status=line).linked().out.latches)

@@ -64,7 +64,7 @@ def test_a_status_line_of_any_other_form_is_refused_whole(line: bytes) -> None:
     assert why(line, False) == "status_malformed"
 
 
-def test_a_checksum_must_be_right_and_a_checked_link_requires_it() -> None:
+def test_a_checksum_must_be_right_and_a_checked_link_needs_it() -> None:
     assert sealed(OK) == b"!status estop=ok*9C94"
     assert decode_status(sealed(OK), True) == decode_status(OK, False)
     assert why(OK, True) == "status_without_crc"

@@ -157,7 +157,7 @@ def test_no_old_command_is_obeyed_and_few_prompt_ones_are_refused(name: str, ech
 
 
 @each("step", [10.0, -10.0, -0.4])
-def test_after_a_step_of_the_clock_no_old_command_counts_and_the_cause_is_named(
+def test_after_a_clock_step_no_old_command_counts_and_the_cause_is_named(
     step: float,
 ) -> None:
     dice = random.Random(1)

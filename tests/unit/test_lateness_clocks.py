@@ -149,9 +149,7 @@ print("real-time scheduling" in asked, *resource.getrlimit(resource.RLIMIT_RTTIM
 
 
 @pytest.mark.parametrize(("hard_us", "low"), [(200_000, True), (700_000, False)])
-def test_a_low_hard_limit_of_real_time_work_does_not_end_the_daemon(
-    hard_us: int, low: bool
-) -> None:
+def test_a_low_hard_limit_of_real_time_does_not_end_the_daemon(hard_us: int, low: bool) -> None:
     """With a `low` limit, the process stays without real-time scheduling."""
     done = subprocess.run(
         [*WITHOUT_RAISING_LIMITS, sys.executable, "-c", REQUEST.format(hard_us=hard_us)],

@@ -74,7 +74,7 @@ def test_a_measurement_older_than_a_minute_counts_only_since_the_start() -> None
 
 @settings(max_examples=40)
 @given(st.lists(st.tuples(st.integers(0, 20 * NS_PER_S), st.integers(0, 10**9)), max_size=60))
-def test_the_last_minute_equals_a_histogram_of_its_measurements(
+def test_the_last_minute_is_a_histogram_of_its_figures(
     measurements: list[tuple[int, int]],
 ) -> None:
     stopwatch, now_ns, samples = Stopwatch(), 0, []

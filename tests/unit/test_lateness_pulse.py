@@ -85,9 +85,7 @@ async def test_missed_periods_are_counted_once_and_never_made_up() -> None:
     assert all(period.expired for _, period in steps.all)
 
 
-async def test_after_a_stall_an_event_counts_the_periods_and_the_timer_runs_no_further_step() -> (
-    None
-):
+async def test_after_a_stall_an_event_counts_the_periods_and_no_further_step_runs() -> None:
     steps, loop = Steps(), asyncio.get_running_loop()
 
     def stall() -> None:

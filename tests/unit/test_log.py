@@ -201,7 +201,7 @@ def test_a_changed_log_level_applies_to_the_next_events(tmp_path: Path) -> None:
     assert all(set(line) == {"timestamp", "level", "event", "text"} for line in records)
 
 
-def test_a_pipe_that_nobody_reads_blocks_neither_output_stream(
+def test_a_pipe_that_nobody_reads_blocks_no_output_stream(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     reader, writer = os.pipe()

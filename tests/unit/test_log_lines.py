@@ -176,9 +176,7 @@ def test_printable_json_decodes_to_the_same_value(text: str) -> None:
         (99.4, 1.0, "99 s"), (240.0, 1.0, "4.0 min"), (7300.0, 1.0, "2.0 h"), (9e5, 1.0, "10 d"),
     ],
 )  # fmt: skip
-def test_a_rough_duration_has_two_digits_in_its_own_unit(
-    seconds: float | None, unit: float, text: str
-) -> None:
+def test_a_rough_duration_has_two_digits(seconds: float | None, unit: float, text: str) -> None:
     assert rough(seconds, unit) == text
 
 

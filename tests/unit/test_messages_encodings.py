@@ -99,9 +99,7 @@ MESSAGES = [
 
 @each("message", MESSAGES)
 @each("form", ["json", "msgpack"])
-def test_a_client_ignores_unknown_fields_and_the_daemon_refuses_them(
-    message: Message, form: Format
-) -> None:
+def test_a_client_ignores_unknown_fields_the_daemon_refuses(message: Message, form: Format) -> None:
     plain, more, kind = encode(message, form), encode(grown(message), form), type(message)
     assert Decoder(kind).decode("", more) == message
     received = StrictDecoder(kind).decode("", plain)
@@ -216,9 +214,7 @@ def test_a_payload_that_is_not_the_message_is_refused_with_its_reason(
         (b'{"linear":\n}', "line 2, column 1: invalid character"),
     ],
 )  # fmt: skip
-def test_text_that_is_not_json_is_reported_with_its_line_and_column(
-    payload: bytes, text: str
-) -> None:
+def test_text_that_is_no_json_has_its_line_and_column(payload: bytes, text: str) -> None:
     with pytest.raises(DecodeError) as refused:
         Decoder(Twist).decode(JSON, payload)
     assert (refused.value.reason, str(refused.value)) == ("malformed", text)
@@ -247,9 +243,7 @@ vector = st.builds(Vector3, axis, axis, axis)
 
 
 @given(st.builds(Twist, vector, vector), st.sampled_from(FORMATS), st.booleans())
-def test_every_finite_twist_is_decoded_exactly_as_it_was_encoded(
-    twist: Twist, form: Format, named: bool
-) -> None:
+def test_every_finite_twist_is_decoded_as_encoded(twist: Twist, form: Format, named: bool) -> None:
     encoding = encoding_name(form, "Twist") if named else ""
     assert Decoder(Twist).decode(encoding, encode(twist, form)) == twist
 

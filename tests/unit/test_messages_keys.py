@@ -129,9 +129,7 @@ def test_each_row_has_a_role_for_exactly_the_uses_of_its_direction() -> None:
      *((key, "") for key in ("", "no/such/key", "cmd/", "cmd/a/b/c", "json/nonsense",
                              "whoami/admin"))],
 )  # fmt: skip
-def test_a_key_has_the_expected_least_role_and_an_unknown_key_has_none(
-    key: str, role: Role | str
-) -> None:
+def test_a_key_has_its_least_role_and_an_unknown_key_none(key: str, role: Role | str) -> None:
     if role:
         assert least_role(key) == role
     else:

@@ -321,9 +321,7 @@ def steps_of(
     ],
 )  # fmt: skip
 @each("hz", [0.0, 0.5, 1.0, 3.0, 10.0, 30.0, 50.0, 80.0, 100.0, 1000.0])
-def test_the_average_rate_is_the_configured_one(
-    key: str, setting: str, most: float, hz: float
-) -> None:
+def test_the_average_rate_is_as_configured(key: str, setting: str, most: float, hz: float) -> None:
     times = steps_of(key, rates(**{setting: hz}))
     assert abs(len(times) - min(hz or most, most) * 10) <= 1
 

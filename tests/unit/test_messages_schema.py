@@ -120,9 +120,7 @@ def test_the_incoming_and_outgoing_schemas_are_those_of_the_topic_table() -> Non
         ("Config", "LogConfig", "level", {"debug", "info", "warning", "error"}),
     ],
 )  # fmt: skip
-def test_a_closed_set_of_values_is_an_enum(
-    name: str, part: str, field: str, values: set[object]
-) -> None:
+def test_a_closed_set_is_an_enum(name: str, part: str, field: str, values: set[object]) -> None:
     found = SCHEMAS[name]
     fields = (found["$defs"][part] if part else found)["properties"]
     assert set(fields[field]["enum"]) == values

@@ -127,9 +127,7 @@ def suspend(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(clock, "asleep_ns", lambda: asleep_ns)
 
 
-def test_a_command_is_put_with_the_stamp_the_clock_and_the_echo_of_its_sender(
-    bus: Bus, relay: Relay
-) -> None:
+def test_a_command_has_its_sender_s_stamp_clock_and_echo(bus: Bus, relay: Relay) -> None:
     for stamp_ns, echo in ((1000, Beat(7, 5)), (2000, None)):
         bus.outbox.take(relay, Wish(Twist(0.2, -0.5), stamp_ns, echo))
         bus.outbox.flush(PATIENCE_S)
@@ -142,7 +140,7 @@ def test_a_command_is_put_with_the_stamp_the_clock_and_the_echo_of_its_sender(
     assert bus.counts.all() == {"commands": 2}
 
 
-def test_only_the_newest_command_of_each_sender_is_sent_after_the_bus_was_blocked(
+def test_only_each_sender_s_newest_command_is_sent_after_a_blocked_bus(
     bus: Bus, relay: Relay
 ) -> None:
     bus.block()
@@ -163,9 +161,7 @@ def test_a_speed_that_waited_during_a_suspend_is_dropped(
     assert bus.counts.all()["commands_dropped"] == 1
 
 
-def test_the_zero_of_a_sender_that_leaves_while_the_bus_is_blocked_is_sent(
-    bus: Bus, relay: Relay
-) -> None:
+def test_the_zero_of_a_sender_that_leaves_a_blocked_bus_is_sent(bus: Bus, relay: Relay) -> None:
     bus.free.clear()
     bus.outbox.take(relay, AHEAD)
     assert bus.entered.wait(PATIENCE_S)

@@ -118,9 +118,7 @@ WISHES: list[tuple[rcl.ParameterValue, object]] = [
 
 
 @each(("value", "expected"), WISHES)
-def test_a_set_request_gives_a_plain_value_for_each_name(
-    value: rcl.ParameterValue, expected: object
-) -> None:
+def test_a_set_request_gives_plain_values(value: rcl.ParameterValue, expected: object) -> None:
     asked = rcl.SetRequest([rcl.Parameter("limits.linear_speed", value)])
     assert rcl.requested_values(Cdr(rcl.SetRequest).encode(asked)) == {
         "limits.linear_speed": expected
@@ -196,7 +194,7 @@ DOUBLE, INTEGER = 3, 2
         ParameterDescriptor("no.such", 0),
     ],
 )  # fmt: skip
-def test_a_parameter_is_described_with_its_range_and_condition(
+def test_a_parameter_is_described_by_range_and_condition(
     expected: ParameterDescriptor,
 ) -> None:
     assert described(expected.name, expected.type) == expected

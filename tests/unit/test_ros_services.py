@@ -81,9 +81,7 @@ def test_a_ros_trigger_of_any_length_makes_a_request_and_its_answer_is_cdr(
 
 @each("topic", ["srv/clear", "parameters/list_parameters"])
 @each("attachment", [b"", bytes(20)])
-def test_over_rmw_a_request_without_a_valid_attachment_is_not_answered(
-    topic: str, attachment: bytes
-) -> None:
+def test_over_rmw_a_request_needs_a_valid_attachment(topic: str, attachment: bytes) -> None:
     made = queries()
     with pytest.raises(DecodeError) as caught:
         served(ros_query(topic, attachment=attachment), made)
@@ -118,9 +116,7 @@ def results(service: str, payload: bytes) -> list[rcl.SetParametersResult]:
 
 @each("via", VIAS)
 @each("service", rcl.SETTING_SERVICES)
-def test_a_request_to_set_parameters_goes_to_the_robot_and_returns_its_answer(
-    service: str, via: str
-) -> None:
+def test_a_request_to_set_parameters_returns_the_robot_s_answer(service: str, via: str) -> None:
     made = queries()
     request = served(ros_query(f"parameters/{service}", via, set_request(0.7)), made)
     assert isinstance(request, Request)

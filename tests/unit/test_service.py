@@ -121,7 +121,7 @@ def files_in(root: Path) -> set[str]:
     return {str(path.relative_to(root)) for path in root.rglob("*") if not path.is_dir()}
 
 
-def test_a_removal_leaves_what_the_user_may_miss_and_says_so_and_a_purge_leaves_nothing(
+def test_a_removal_says_what_it_leaves_and_a_purge_leaves_nothing(
     machine: Path,
 ) -> None:
     leaving, *steps = uninstalling(purge=False)

@@ -112,9 +112,7 @@ def program(monkeypatch: pytest.MonkeyPatch, where: Path, text: str) -> None:
     monkeypatch.setattr(sys, "executable", str(file))
 
 
-def test_a_program_that_falls_silent_is_killed(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
+def test_a_silent_program_is_killed(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setattr("acsard.host.child.SILENCE_TIMEOUT_NS", 0)
     pid = tmp_path / "pid"
     stops = f"import os; os.write(0, b'.'); open({str(pid)!r}, 'w').write(str(os.getpid())); "

@@ -117,9 +117,7 @@ def feeds(manager: Manager, there: Systemd, period_ns: int, steps: int) -> list[
 
 
 @pytest.mark.parametrize("period_ms", [1, 10, 20, 33, 50, 100])
-def test_the_watchdog_is_fed_at_its_interval_and_not_in_each_step(
-    manager: Manager, period_ms: int
-) -> None:
+def test_the_watchdog_is_fed_at_its_interval_only(manager: Manager, period_ms: int) -> None:
     there = systemd(manager, WATCHDOG_USEC="200000")
     fed = feeds(manager, there, period_ms * MS, 2000 // period_ms)
     assert fed[0] == NS_PER_S + period_ms * MS
@@ -194,7 +192,7 @@ def fill(there: Systemd) -> int:
     return step
 
 
-def test_a_full_queue_neither_blocks_nor_raises_and_the_watchdog_is_fed_after_it(
+def test_a_full_queue_blocks_nothing_and_the_watchdog_is_fed_after_it(
     manager: Manager,
 ) -> None:
     there = systemd(manager, WATCHDOG_USEC="200000")

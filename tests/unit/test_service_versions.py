@@ -37,9 +37,7 @@ def test_a_new_version_in_use_makes_the_one_before_it_the_previous_one(tmp_path:
     assert (tmp_path / "current" / "bin").is_dir(), "the link is relative"
 
 
-def test_the_link_is_never_missing_while_it_changes(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_link_is_never_missing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     versions_in(tmp_path, "0.2.0", "0.3.0")
     versions.use("0.2.0", tmp_path)
     monkeypatch.setattr(os, "replace", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
@@ -93,9 +91,7 @@ def test_the_copy_has_acsard_and_the_libraries_of_its_users_but_no_developer_s()
     assert not {"pytest", "mypy", "hypothesis"} & names
 
 
-def test_a_full_disk_leaves_no_part_of_a_copy(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_full_disk_leaves_no_part(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def full(place: Path, python: str) -> None:
         (place / "lib").mkdir()
         raise OSError(28, "No space left on device")

@@ -67,7 +67,7 @@ def verdict(text: str) -> list[str]:
     return [f"? {warning}" for warning in warnings(config)]
 
 
-def test_each_configuration_has_its_problems_and_warnings(
+def test_each_configuration_has_its_verdict(
     approved: Callable[[Path, str], None],
 ) -> None:
     blocks = []
@@ -219,9 +219,7 @@ def test_the_effective_configuration_reads_back_as_the_same_configuration() -> N
     ],
 )  # fmt: skip
 @each("tls", ["", "/etc/acsard/tls"])
-def test_the_check_refuses_the_addresses_that_the_page_refuses(
-    addresses: tuple[str, ...], tls: str
-) -> None:
+def test_check_and_page_refuse_the_same_addresses(addresses: tuple[str, ...], tls: str) -> None:
     try:
         endpoints = [parse_listen(address) for address in addresses]
         refused = any(address.secure for address in endpoints) and not tls

@@ -55,9 +55,7 @@ def test_a_change_of_the_reference_file_changes_only_the_values(tmp_path: Path) 
     assert os.listdir(tmp_path) == ["acsard.toml"]
 
 
-def test_an_edit_that_fails_leaves_the_file_unchanged(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_failed_edit_changes_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     file = tmp_path / "acsard.toml"
     file.write_text("[mcu]\n")
 

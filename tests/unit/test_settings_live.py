@@ -124,9 +124,7 @@ VALUES: dict[str, list[object]] = {
 @pytest.mark.slow
 @each(("key", "value"), [(key, value) for key, values in VALUES.items() for value in values])
 @each("beside", [{}, {"limits.angular_speed": 20.0, "limits.linear_speed": 4.5}])
-def test_a_change_is_validated_like_the_file(
-    key: str, value: object, beside: dict[str, object]
-) -> None:
+def test_a_change_is_judged_as_the_file(key: str, value: object, beside: dict[str, object]) -> None:
     wishes = beside | {key: value}
     judged = by_file(wishes)
     if isinstance(judged, Config):
@@ -148,9 +146,7 @@ def test_a_change_is_validated_like_the_file(
         ("mcu.port", "/dev/x", "only when the daemon starts: change it in acsard.toml"),
     ],
 )
-def test_a_setting_that_cannot_be_set_is_reported_with_the_remedy(
-    key: str, value: object, words: str
-) -> None:
+def test_a_setting_that_cannot_be_set_has_a_remedy(key: str, value: object, words: str) -> None:
     (line,) = problems({key: value})
     assert words in line
     assert len(line) < 300
@@ -181,9 +177,7 @@ def test_braking_can_be_made_harder_while_driving_but_softer_only_at_rest(key: s
     [("limits.wheel_speed", 39.0), ("limits.wheel_speed", 41.0),
      ("commands.sources.nav.timeout", 0.5)],
 )  # fmt: skip
-def test_settings_that_would_jump_or_reset_the_arbiter_are_refused_while_driving(
-    key: str, value: float
-) -> None:
+def test_what_would_jump_or_reset_the_arbiter_waits_for_rest(key: str, value: float) -> None:
     (line,) = problems({key: value}, at_rest=False)
     assert "only while the robot stands" in line
     assert changed(CONFIG, {key: value}, at_rest=True)[1]

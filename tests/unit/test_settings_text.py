@@ -179,9 +179,7 @@ def test_an_edit_that_makes_the_file_invalid_is_refused(text: str, keys: dict[st
     ("names", "comments"),
     [(["anna", "eve", "carl"], ["anna", "hall 3", "bob"]), (["eve", "carl"], ["bob"]), ([], [])],
 )
-def test_a_changed_list_keeps_the_comments_of_its_items(
-    names: list[str], comments: list[str]
-) -> None:
+def test_a_changed_list_keeps_its_items_comments(names: list[str], comments: list[str]) -> None:
     text = """[access]
 operators = [
     "anna",   # hall 3, until May

@@ -22,9 +22,7 @@ from tests.each import each
         ("", ""), ("'", "'"), ("2026-01-01", "2026-01-01"), ("{a = 1}", "{a = 1}"),
     ],
 )  # fmt: skip
-def test_a_value_is_written_as_in_the_file_and_a_bare_word_is_a_text(
-    word: str, value: object
-) -> None:
+def test_a_value_is_as_in_the_file_and_a_bare_word_is_a_text(word: str, value: object) -> None:
     settings = pairs(["log.level", word])
     assert settings == {"log.level": value}
     assert type(settings["log.level"]) is type(value)

@@ -148,9 +148,7 @@ def test_coarse_encoders_count_whole_steps_and_motors_lag() -> None:
 
 
 @pytest.mark.parametrize(("baud", "line_ns"), [(9600, 34_375_000), (115200, 2_864_583)])
-def test_lines_and_answers_take_their_time_on_the_wire_one_after_the_other(
-    baud: Any, line_ns: int
-) -> None:
+def test_lines_and_answers_follow_each_other_on_the_wire(baud: Any, line_ns: int) -> None:
     mcu = FakeMcu(replace(TRUE, mcu=McuConfig(baud_rate=baud)))
     mcu.receive(1000, LINE * 8)
     sent = [when for when, _ in replies(mcu, 2000 * MS)]

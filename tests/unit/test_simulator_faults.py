@@ -95,9 +95,7 @@ def test_a_fault_of_the_report_does_not_change_the_motion(
         (b"apnan,bp01.00,cp01.00,dp01.00,\r\n", [0.0, 1.0, 1.0, 1.0]),
     ],
 )
-def test_a_comma_latched_board_takes_each_wheel_at_its_comma(
-    line: bytes, set_points: list[float]
-) -> None:
+def test_a_comma_latched_board_takes_wheels_at_commas(line: bytes, set_points: list[float]) -> None:
     mcu = FakeMcu(TRUE)
     with mcu.comma_latched():
         drive(mcu, 0, 1, line)
@@ -136,9 +134,7 @@ EXAMPLE = {"m": "b", "mm": "b:c", "mn": "b:2", "n": "9600", "nn": "5:0.1", "nnn"
 EACH = (*FAULTS, *(f"{name}={EXAMPLE[kinds]}" for name, kinds in ARGUMENTS.items()))
 
 
-def test_each_named_fault_can_be_turned_on_and_off_and_is_active_from_the_start_if_configured() -> (
-    None
-):
+def test_each_fault_can_be_turned_on_and_off_and_is_on_at_the_start_if_configured() -> None:
     mcu = FakeMcu(Config())
     before = dict(vars(mcu))
     for text in EACH:

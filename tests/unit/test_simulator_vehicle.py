@@ -57,9 +57,7 @@ def test_a_motor_approaches_its_set_point_exponentially(seconds: float, lag: flo
 
 
 @given(st.lists(st.floats(1e-4, 0.5), min_size=1, max_size=12), four)
-def test_the_motion_from_rest_does_not_depend_on_the_time_steps(
-    pieces: list[float], goal: list[float]
-) -> None:
+def test_motion_does_not_depend_on_the_time_steps(pieces: list[float], goal: list[float]) -> None:
     whole, cut = moved(sum(pieces), *goal, lag=LAG), moved(0.0, *goal, lag=LAG)
     for piece in pieces:
         cut.advance(piece)

@@ -107,9 +107,7 @@ def test_wheels_that_keep_their_last_speed_after_a_stop_roll_on(keeps: float) ->
 
 @each("counts", [16, 3200])
 @each("speed", [0.8, 1.4, 10.0])
-def test_a_robot_that_is_faster_than_its_limiter_for_a_second_is_a_fault(
-    speed: float, counts: int
-) -> None:
+def test_a_robot_faster_than_its_limiter_for_a_second_is_a_fault(speed: float, counts: int) -> None:
     """It is beyond a fifth more by 0.3 rad and 1.5 counts, too."""
     bench, fast = Bench(counts).driven(speed), 1.35 * speed
     beyond_s = max(0.3, 1.5 * count_angle(counts)) / (fast - 1.2 * speed)
@@ -177,9 +175,7 @@ def test_both_wheels_of_a_side_that_report_no_turn_may_have_turned() -> None:
 
 @each("wheel", range(4))
 @each("speed", [0.0, -10.0])
-def test_a_faulty_wheel_is_left_out_within_sixty_milliseconds_and_named(
-    wheel: int, speed: float
-) -> None:
+def test_a_faulty_wheel_is_left_out_within_60_ms_and_named(wheel: int, speed: float) -> None:
     bench = Bench().driven()
     assert bench.run(only(wheel, speed), 10.0, 1.0) <= 0.06
     assert bench.wheels.status.left_out == (WHEELS[wheel],)
@@ -216,9 +212,7 @@ def test_the_wheel_angles_are_those_of_the_encoders_even_if_a_wheel_is_left_out(
 
 @each("pushed", [0.5, 3.0, 12.0])
 @each("wheel", range(4))
-def test_a_push_by_hand_leaves_no_wheel_out_unless_a_gyro_shows_one(
-    pushed: float, wheel: int
-) -> None:
+def test_a_push_leaves_no_wheel_out_unless_a_gyro_shows_one(pushed: float, wheel: int) -> None:
     """Three wheels roll and one hangs in the air, or only the wheel in the air turns."""
     for speeds in (only(wheel, 0.0, pushed), only(wheel, pushed, 0.0)):
         bench = Bench()
