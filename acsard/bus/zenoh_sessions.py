@@ -200,8 +200,11 @@ def _opened(settings: dict[str, object], where: tuple[str, ...]) -> zenoh.Sessio
     try:
         return zenoh.open(_config(settings))
     except zenoh.ZError as error:
+        reason = first_line(error)
+        if number := re.search(r"\(os error (\d+)\)", reason):
+            reason = os.strerror(int(number[1]))
         raise InUseError(
-            f"cannot listen on {', '.join(where)}: {first_line(error)}; if another daemon or "
+            f"cannot listen on {', '.join(where)}: {reason}; if another daemon or "
             "router uses the address, stop that program, or choose another address with --listen "
             "or in bus.listen",
         ) from error
@@ -235,7 +238,7 @@ def client_session(endpoint: str, tls: str = "") -> zenoh.Session:
         settings |= _tls(tls)
     try:
         return zenoh.open(_config(settings))
-    except zenoh.ZError as error:
+    except zenoh.ZError:
         reason = ""
         if secured:
             _require_accepted(tls)
@@ -245,8 +248,8 @@ def client_session(endpoint: str, tls: str = "") -> zenoh.Session:
             f"no daemon answers at {endpoint}: "
             + (
                 reason
-                or "is `acsard run` running there, does its bus.listen contain this address, and "
-                f"are fewer than {MAX_SESSIONS} clients connected? ({first_line(error)})"
+                or "start it there: `acsard run`. If it runs, its bus.listen needs this address, "
+                f"and it serves {MAX_SESSIONS} clients at most"
             )
         ) from None
 

@@ -15,6 +15,7 @@ from importlib.util import find_spec
 from pathlib import Path
 
 from acsard.bus.address import address_of
+from acsard.bus.robot_discovery import ALL_ROBOTS, running_robots
 from acsard.bus.zenoh_sessions import reachable
 from acsard.cli.common import add_config, add_port, load, with_record_directory
 from acsard.client.connection import open_connection
@@ -149,14 +150,19 @@ def main(args: argparse.Namespace) -> int:
 def _owner(config: Config) -> str:
     # Says which daemon already runs, if one answers at the address of this one.
     address = address_of(config)
-    with suppress(AcsardError), open_connection(address) as robot:
-        pid = robot.get("info").pid
-        return (
-            f"acsard already runs: the process {pid} answers at {address.endpoint} as robot "
-            f"{address.robot_id}. Use it, or end it: `kill {pid}`, or `sudo systemctl stop acsard` "
-            "if it is the service. For a second daemon, choose another address with --listen or in "
-            "bus.listen"
-        )
+    endpoint = address.endpoint
+    with suppress(AcsardError), open_connection(address) as there:
+        ids = running_robots(there.session, (ALL_ROBOTS, address.robot_id), endpoint)
+        # Behind a router are other computers' robots, too.
+        if ids and not there.session.info.routers_zid():
+            with open_connection(address._replace(robot_id=ids[0])) as robot:
+                pid = robot.get("info").pid
+            return (
+                f"acsard already runs: the process {pid} answers at {endpoint} as robot {ids[0]}. "
+                f"Use it, or end it: `kill {pid}`, or `sudo systemctl stop acsard` if it is the "
+                "service. For a second daemon, choose another address with --listen or in "
+                "bus.listen"
+            )
     return ""
 
 

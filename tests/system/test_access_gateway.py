@@ -168,7 +168,9 @@ def gateway_with(own: Path, tls: str) -> Gateway:
 def test_an_address_in_use_is_not_a_bad_certificate(certificates: Certificates) -> None:
     with socket.create_server(("127.0.0.1", 0)) as other:
         tls = f"tls/127.0.0.1:{other.getsockname()[1]}"
-        with pytest.raises(InUseError, match=f"cannot listen on {tls}: .*stop that program"):
+        with pytest.raises(
+            InUseError, match=f"cannot listen on {tls}: Address already in use; .*stop that program"
+        ):
             gateway_with(certificates.robot, tls).open()
 
 

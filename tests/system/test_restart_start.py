@@ -120,7 +120,11 @@ def test_a_second_daemon_on_the_bus_address_ends_with_75_before_a_byte_on_its_ow
     tmp_path: Path, peer: Peer
 ) -> None:
     with Daemon(tmp_path) as first:
-        config: Tables = {"mcu": {"port": str(peer.path)}, "bus": {"listen": [first.endpoint]}}
+        config: Tables = {
+            "robot": {"id": "other"},
+            "mcu": {"port": str(peer.path)},
+            "bus": {"listen": [first.endpoint]},
+        }
         path = write_config(tmp_path / "second.toml", config)
         second = finish(acsard("run", "--config", str(path)), tmp_path)
         assert first.process.poll() is None
