@@ -10,7 +10,6 @@ from __future__ import annotations
 import ipaddress
 import os
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
@@ -224,28 +223,14 @@ def _key_pem(key: ec.EllipticCurvePrivateKey) -> bytes:
 
 
 def _write(files: Mapping[Path, tuple[bytes, int]]) -> None:
-    # All or none: a key and its certificate belong together. Never with more permissions than the
-    # mode. Raises `MendableError`.
-    new = {path: path.with_name(f"{path.name}.new") for path in files}
-    owner, before, replaced = (os.geteuid(), os.getegid()), dict[Path, bytes](), list[Path]()
+    # Never with more permissions than the mode. Raises `MendableError`.
     try:
         for path, (data, mode) in files.items():
-            if path.exists():
-                before[path] = path.read_bytes()
-            replace(new[path], data, mode=mode, owner=owner)
-        for path, written in new.items():
-            written.replace(path)
-            replaced.append(path)
+            replace(path, data, mode=mode, owner=(os.geteuid(), os.getegid()))
+    except PermissionError:
+        raise
     except OSError as error:
-        for earlier in replaced:
-            if earlier in before:
-                replace(earlier, before[earlier], mode=files[earlier][1], owner=owner)
-            else:
-                earlier.unlink()
-        if isinstance(error, PermissionError):
-            raise
-        raise MendableError(f"cannot write {path}: {error.strerror}") from None
-    finally:
-        for written in new.values():
-            with suppress(OSError):
-                written.unlink(missing_ok=True)
+        raise MendableError(
+            f"cannot write {path}: {error.strerror}; the key and its certificate belong together, "
+            "so remove the cause and run the command again"
+        ) from None

@@ -13,7 +13,6 @@ import pytest
 from cryptography import x509
 from cryptography.hazmat.primitives.asymmetric import ec
 
-from acsard.host.errors import MendableError
 from acsard.machine.authority import Authority
 from tests.each import each
 
@@ -75,11 +74,3 @@ def test_an_authority_of_another_program_without_constraints_may_sign_for_any_na
     certificate = x509.load_pem_x509_certificate((tmp_path / "certificate.pem").read_bytes())
     key = ec.generate_private_key(ec.SECP256R1())
     assert Authority(certificate, key).permits("bank.example")
-
-
-def test_a_directory_in_the_place_of_a_file_leaves_no_half_of_a_pair(tmp_path: Path) -> None:
-    mine, own = Authority.make(tmp_path / "ca", "test", 1, OWN), tmp_path / "robot"
-    (own / "key.pem").mkdir(parents=True)
-    with pytest.raises(MendableError, match=r"cannot write .*key.pem"):
-        mine.issue(own, "robot", ["robot1"], 1)
-    assert [path.name for path in own.iterdir()] == ["key.pem"]
