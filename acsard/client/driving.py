@@ -21,7 +21,6 @@ from acsard.client.follower import FIRST_STATE_TIMEOUT_S, Followed, Watch
 from acsard.client.ride import (
     GRACE_S,
     SEND_PERIOD_S,
-    SILENCE,
     Ride,
     can_drive,
     lacks_only_commands,
@@ -106,13 +105,8 @@ class Driver:
         It is an `UnheardError` if the daemon receives nothing from this source.
         """
         ride, state, source = self.ride, self.watch.state, self.robot.source
-        if self.watch.silent(clock.steady_s()):
-            raise NoAnswerError(
-                "the daemon's state cannot be read: does the daemon run another version of acsard "
-                "than this program? Use the same version for both"
-                if self.watch.unreadable
-                else SILENCE.format(self.watch.silence_timeout_s)
-            )
+        if silence := self.watch.silence(clock.steady_s()):
+            raise NoAnswerError(silence)
         if not ride.ended:
             return
         if state is None or ride.ended != ride.objection or receives_commands(state, source):

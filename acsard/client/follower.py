@@ -18,6 +18,16 @@ from acsard.core.messages.schema import RobotState
 from acsard.core.values import Seconds
 from acsard.host.mailbox import Mailbox
 
+SILENCE = (
+    "nothing received from the daemon for {:g} s: does the daemon run, and does it have the "
+    "robot.id that this program uses? `acsard fleet` lists the robots"
+)
+
+UNREADABLE = (
+    "the daemon's state cannot be read: does the daemon run another version of acsard than this "
+    "program? Use the same version for both"
+)
+
 QUERY_PERIOD_S = 0.3  # without a new state: the robot may be configured to publish seldom
 
 SETTLED_S = 0.2  # for a message on `state` to arrive: a later one shows the robot after an action
@@ -96,6 +106,12 @@ class Follower:
 
     def silent(self, now: Seconds) -> bool:
         return self.age(now) > self.silence_timeout_s
+
+    def silence(self, now: Seconds) -> str:
+        """Return why the robot counts as silent, or ""."""
+        if not self.silent(now):
+            return ""
+        return UNREADABLE if self.unreadable else SILENCE.format(self.silence_timeout_s)
 
 
 def restarted(before: RobotState | None, state: RobotState) -> bool:

@@ -38,11 +38,6 @@ SLOWER, SLOWS_S = 0.97, 1.0
 # That no command moves and that do not end by themselves.
 NEVER_DRIVING_MODES = ("inactive", "stopped", "fault", "shutdown")
 
-SILENCE = (
-    "nothing received from the daemon for {:g} s: does the daemon run, and does it have the "
-    "robot.id that this program uses? `acsard fleet` lists the robots"
-)
-
 PAUSE = (
     "this program sent no command for {:.1f} s, so the robot was stopped and the drive was not "
     "finished: was the computer suspended, did something keep the program from running, or did the "
@@ -160,8 +155,8 @@ class Ride:
                 self._opened = None
         elif self._opened is not None and paused > GRACE_S:
             self._begin(PAUSE.format(paused))
-        elif self._follower.silent(now):
-            self._begin(SILENCE.format(self._follower.silence_timeout_s))
+        elif silence := self._follower.silence(now):
+            self._begin(silence)
         elif self._is_open and self.objection and now - self.followed >= self.grace_s:
             self._begin(self.objection)
         elif not self._is_open:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections import deque
 
 from acsard.client.connection import Connection
@@ -9,7 +10,7 @@ from acsard.client.follower import Watch, restarted
 from acsard.core.messages.encodings import DecodeError
 from acsard.core.messages.schema import Info, RobotState
 from acsard.host import clock
-from acsard.host.errors import MendableError, ReplyError
+from acsard.host.errors import MendableError, NoAnswerError
 from acsard.top.screen import ScreenData
 
 
@@ -22,23 +23,6 @@ class Feed:
         self._info = self._ask_info()
         self._watch = Watch(robot, clock.steady_s())
         self._past: deque[tuple[float, RobotState]] = deque()
-
-    def query_state(self) -> None:
-        """Query the present state. Raises `ReplyError`, and the errors of `Connection.get`."""
-        try:
-            state: RobotState = self._robot.get("state")
-        except DecodeError as error:
-            self._watch.unreadable += 1
-            raise ReplyError(
-                f"cannot read the daemon's state ({error}); is the daemon a different version of "
-                "acsard? Use the same version here"
-            ) from None
-        # First process the states that have arrived. One of them may be newer than the answer.
-        self.poll()
-        previous, now = self._watch.state, clock.steady_s()
-        if previous is None or state.stamp.to_ns() > previous.stamp.to_ns():
-            self._watch.answered(state, now)
-            self._take(state, now)
 
     def poll(self) -> None:
         """Store the newest state that has arrived since the last call."""
@@ -54,6 +38,18 @@ class Feed:
         # Rates are averaged over a second. Over a shorter time they would jump.
         while len(self._past) > 2 and now - self._past[1][0] >= 1.0:
             self._past.popleft()
+
+    def wait(self) -> None:
+        """Wait for the states of half a second, over which rates are averaged, or of 3 s at most.
+
+        Raises `NoAnswerError` without any state.
+        """
+        begun = clock.steady_s()
+        while self.screen_data().passed < 0.5 and clock.steady_s() - begun < 3.0:
+            time.sleep(0.05)
+            self.poll()
+        if self._watch.state is None:
+            raise NoAnswerError(self._watch.silence(clock.steady_s()))
 
     def screen_data(self, hint: str = "") -> ScreenData:
         """Return what the screen of `acsard top` shows, with a text for its header."""

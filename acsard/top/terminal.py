@@ -17,13 +17,12 @@ import signal
 import sys
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 
 from rich.console import Console, Group, RenderableType
 from rich.live import Live
 from rich.text import Text
 
-from acsard.core.values import AcsardError
 from acsard.host import clock
 from acsard.host.logs import Writer
 from acsard.host.terminal_modes import single_key_mode
@@ -50,9 +49,7 @@ SCREEN_END_SIGNALS = (
 
 
 def one_screen(feed: Feed) -> str:
-    feed.query_state()
-    time.sleep(0.5)  # rates are averaged over this time
-    feed.query_state()
+    feed.wait()
     _be_lenient()
     width = Console().width
     return plain(screen(feed.screen_data(), width), width=width)
@@ -60,9 +57,6 @@ def one_screen(feed: Feed) -> str:
 
 def show_live(feed: Feed) -> None:
     """Show the screen of `acsard top` until `q` is typed, the input ends or a signal arrives."""
-    # A failed query does not matter, because the screen says that it waits for a state.
-    with suppress(AcsardError):
-        feed.query_state()
 
     def draw(width: int, height: int) -> RenderableType:
         feed.poll()

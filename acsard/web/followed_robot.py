@@ -23,7 +23,7 @@ from msgspec import Struct
 from acsard.bus.address import Address
 from acsard.bus.tls_files import shown_at
 from acsard.client.connection import Connection
-from acsard.client.follower import Watch, restarted
+from acsard.client.follower import UNREADABLE, Watch, restarted
 from acsard.core.config.settings import RatesConfig
 from acsard.core.messages.encodings import DecodeError
 from acsard.core.messages.schema import Info, RobotState
@@ -116,10 +116,7 @@ class FollowedRobot:
             return self._not_connected
         is_silent = watch.silent(clock.steady_s())
         if is_silent and watch.unreadable:
-            return (
-                "the daemon's state cannot be read: does the daemon run another version of "
-                "acsard? Use the same version here"
-            )
+            return UNREADABLE
         if not watch.is_confirmed:
             return self._not_connected
         if is_silent:
