@@ -1,16 +1,9 @@
 """The geometry and the noise from the calibration of a log also describe other drives.
 
-`-n 0 -s -m "soak or not soak"` prints the table of `deploy/calibration`. A row describes the robots
-of one kind by these figures:
-
-- the NEES with three degrees of freedom after drives of a minute, with the fitted noise and with
-  the default noise,
-- the squared errors of heading and distance after 10 s, divided by the variances that the odometry
-  states,
-- the error of the heading after 10 s, and the same error with the best track and radii, which a
-  least-squares fit to the true motion finds,
-- z: the error of the track, and the error of the ratio of the left to the right wheel radius,
-  each divided by its standard deviation.
+`-n 0 -s -m soak` prints the figures of the manual's page about calibration: the NEES after drives
+of a minute, with the fitted and with the default noise; the squared errors of heading and distance
+after 10 s in the variances that the odometry states; the error of the heading after 10 s, and that
+of the best track and radii; and the errors of track and radii in their standard deviations.
 """
 
 from __future__ import annotations
@@ -51,7 +44,7 @@ PIECE = 1000
 """Number of feedback lines after which heading and distance are judged: 10 s."""
 
 ROBOTS = 6
-"""Number of robots in a row of `deploy/calibration`."""
+"""Number of robots in a row."""
 
 GYRO_SCALE = 0.005
 

@@ -8,14 +8,13 @@ from contextlib import contextmanager
 
 import pytest
 
-from acsard.checkup import damage, dialect, encoder_counts, line_loss, watchdog
+from acsard.checkup import dialect, encoder_counts, line_loss, watchdog
 from acsard.checkup.board import Board
 from acsard.checkup.findings import StoppedError
 from acsard.checkup.motion import SPEED, BoardReply
 from acsard.checkup.wheels import turn
-from acsard.core.config.settings import Config, SimConfig, WheelMap
+from acsard.core.config.settings import Config, SimConfig
 from acsard.core.link.checked_line import Reading
-from acsard.core.link.codec import Codec, FrameError
 from acsard.core.simulator import protocol
 from tests.each import each
 from tests.unit.checkup_robots import Robot
@@ -59,40 +58,6 @@ def test_wrong_counts_of_one_motor_are_found(share: float, words: str) -> None:
         finding = encoder_counts.finding(board, [0, 1])
     assert (finding.verdict, finding.keys) == ("FAIL", {})
     assert words in finding.text
-
-
-def test_counts_that_do_not_change_while_the_wheels_turn_are_to_be_switched_off() -> None:
-    with Robot(encoder_counts=3200).board() as board:
-        board.sampled = True
-        board.replies = [BoardReply(r.at_s, r.motors, b"", Reading(20 * n % 65536, (7, 7, 7, 7)))
-                         for n, r in enumerate(replies(3200))]  # fmt: skip
-        finding = encoder_counts.finding(board, [0])
-    assert (finding.verdict, finding.keys) == ("FAIL", {"mcu.encoder_counts": 0})
-
-
-@pytest.mark.parametrize(
-    ("configured", "verdict", "keys"),
-    [
-        (0, "SKIPPED", {}),
-        (1600, "SKIPPED", {}),
-        (3210, "PASS", {"mcu.encoder_counts": 3210}),
-    ],
-)
-def test_if_lines_are_lost_only_configured_or_identified_counts_are_proposed(
-    configured: int, verdict: str, keys: dict[str, object]
-) -> None:
-    with Robot("no_sample", link_check="on", encoder_counts=configured).board() as board:
-        board.sampled, board.lost = True, line_loss.MAX_LOSS / 4
-        board.replies = replies(3200)
-        finding = encoder_counts.finding(board, [0])
-        assert (finding.verdict, finding.keys) == (verdict, keys)
-        if verdict == "SKIPPED":
-            assert "0.5% of the lines are lost" in finding.text
-        # a count that the board states itself needs no measurement
-        board.identity = {"counts": "3200"}
-        assert encoder_counts.finding(board, [0]).keys == {"mcu.encoder_counts": 3200}
-        board.lost = 2 * line_loss.MAX_LOSS
-        assert encoder_counts.finding(board, [0]).keys == {}
 
 
 # The watchdog.
@@ -217,26 +182,3 @@ def test_a_board_whose_plain_lines_arrive_damaged_ends_the_check_before_motors_t
     assert "arrived damaged from the board, the last one is `" in end.value.finding.text
     assert "ground" in end.value.finding.mend
     assert robot.mcu.vehicle.angles == [0.0] * 4
-
-
-@pytest.mark.parametrize("comma", [False, True])
-@pytest.mark.parametrize("sealed", [False, True])
-def test_the_parser_refuses_every_broken_line(comma: bool, sealed: bool) -> None:
-    lines = damage.broken_lines(comma, sealed, [0, 1, 2, 3])
-    assert len(lines) == (12 if sealed else 10)
-    assert all(any(line.endswith(end) for _, line in lines) for end in (b"dp03.0\r\n", b"dp0\r\n"))
-    for what, line in lines:
-        assert protocol.reference(line) is None, what
-        if "last number" in what:
-            continue  # the host also reads replies with another number of decimals
-        with pytest.raises(FrameError):
-            Codec(WheelMap()).decode(line.rstrip())
-
-
-def test_rare_reports_by_the_boards_own_clock_are_not_taken_for_answers() -> None:
-    for wait_ms in range(0, 400, 50):
-        robot = Robot("plain_only")
-        with robot.board() as board, robot.mcu.free_running(0.4):
-            board.listen(wait_ms / 1000)
-            assert dialect.form(board) is None
-            assert not board.comma

@@ -9,11 +9,10 @@ from msgspec import structs
 
 from acsard.checkup import motion, wheels
 from acsard.checkup.motion import SHORT_MEASUREMENT_S, BoardReply
-from acsard.checkup.wheels import Channel, Kind, encoder_finding, wheel_map
+from acsard.checkup.wheels import Channel, Kind, encoder_finding
 from acsard.core.config.settings import Config, McuConfig, SimConfig
 from acsard.core.link.checked_line import Reading
 from acsard.core.link.codec import Motors
-from acsard.core.values import WHEELS
 from tests.each import each
 from tests.unit.checkup_robots import Robot
 
@@ -49,18 +48,6 @@ def test_a_coarse_encoder_is_not_a_runaway_but_a_real_runaway_is_found(
     assert runaway is not None
     assert runaway[0] == 1
     assert -10.0 < runaway[1] < -6.0
-
-
-@pytest.mark.parametrize("sampled", [False, True])
-def test_a_sudden_runaway_is_found_by_its_third_reply(sampled: bool) -> None:
-    replies = course(1.0, 3200, 20, 1.0, sampled)
-    for _ in range(3):
-        assert motion.runaway(replies) is None
-        last = replies[-1]
-        counts = (0, last.reading.counts[1] + 200, 0, 0) if last.reading else (0, 0, 0, 0)
-        reading = last.reading and Reading(last.reading.mcu_ms + 20, counts)
-        replies.append(BoardReply(last.at_s + 0.02, (0.0, 19.6, 0.0, 0.0), b"", reading))
-    assert motion.runaway(replies) is not None
 
 
 # Motors.
@@ -99,16 +86,6 @@ def test_the_speeds_of_the_encoders_decide_the_kind_and_verdict_of_a_motor(
     finding = encoder_finding(MCU, channel)
     assert finding.verdict == {"right": "PASS", "off": "WARN"}.get(kind, "FAIL")
     assert bool(finding.mend) is (kind != "right")
-
-
-def test_a_wheel_that_was_seen_for_two_motors_fails_the_wheel_map() -> None:
-    channels = [
-        Channel(m, channel_of(m, m).forth, channel_of(m, m).back, WHEELS[min(m, 2)])
-        for m in range(4)
-    ]
-    finding = wheel_map(MCU, channels)
-    assert (finding.verdict, finding.keys) == ("FAIL", {})
-    assert "rear left" in finding.text
 
 
 def test_a_probe_is_short_and_commands_a_dead_motor_at_most_3_rad_s() -> None:

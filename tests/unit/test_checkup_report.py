@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from typing import Any
 
 import pytest
 
@@ -12,7 +13,6 @@ from acsard.checkup.findings import SKIPPED_STEPS, Finding
 from acsard.checkup.motion import MAX_WATCHDOG_S
 from acsard.checkup.outcomes import OUTCOMES, OUTCOMES_BY_NAME, find
 from acsard.core.config.contradictions import contradictions
-from acsard.core.config.parsing import parse
 from acsard.core.config.settings import Config
 from acsard.core.link.link_state import WATCHDOG_S
 from tests.each import each
@@ -56,49 +56,39 @@ def test_the_summary_counts_the_verdicts_and_has_the_lines_of_toml() -> None:
     assert text == "\n1 PASS\n/srv/robot.toml: nothing to change"
 
 
-def findings_for(**keys: object) -> list[Finding]:
-    return [Finding(k, "PASS", keys={f"mcu.{k}": v}) for k, v in keys.items()]
+CHECKED = {"link_check": "on", "encoder_counts": 3200}
 
 
-def test_only_settings_that_differ_are_proposed() -> None:
-    findings = findings_for(baud_rate=115200, trailing_comma=True, reply_period=0.0)
-    assert checkup_report.changes(findings, Config()) == {"mcu.trailing_comma": True}
+@each(
+    ("found", "now", "port", "changes"),
+    [
+        ({"trailing_comma": True, "reply_period": 0.0}, {}, "/dev/one",
+         {"mcu.trailing_comma": True}),
+        ({"baud_rate": 115200}, {}, "/dev/one", {"mcu.port": "/dev/one"}),  # it answered there
+        # Longer lines only where the wire has room; settings in use are not removed.
+        (CHECKED, {}, "", {"mcu.link_check": "on", "mcu.encoder_counts": 3200}),
+        (CHECKED, {"baud_rate": 57600}, "", {"mcu.link_check": "on"}),
+        (CHECKED, {"baud_rate": 38400}, "", {}),
+        (CHECKED | {"baud_rate": 38400}, CHECKED, "",
+         {"mcu.baud_rate": 38400, "control.rate": "auto"}),
+    ],
+)  # fmt: skip
+def test_what_differs_and_fits_the_wire_is_proposed(
+    found: dict[str, object], now: dict[str, Any], port: str, changes: dict[str, object]
+) -> None:
+    config = configured(Config(), **now)
+    findings = [
+        Finding(name.replace("_", " "), "PASS", keys={f"mcu.{name}": value})
+        for name, value in found.items()
+    ]
+    assert checkup_report.changes(findings, config, port) == changes
 
 
-def test_longer_lines_are_not_proposed_if_the_wire_has_no_room() -> None:
-    wanted = findings_for(link_check="on", encoder_counts=3200)
-    assert len(checkup_report.changes(wanted, Config())) == 2
-    slow = configured(Config(), baud_rate=57600)
-    assert checkup_report.changes(wanted, slow) == {"mcu.link_check": "on"}
-    slower = configured(Config(), baud_rate=38400)
-    assert checkup_report.changes(wanted, slower) == {}
-
-
-def test_a_slow_wire_also_changes_the_control_rate() -> None:
-    keys = checkup_report.changes(findings_for(baud_rate=9600, link_check="on"), Config())
-    assert keys == {"mcu.baud_rate": 9600, "control.rate": "auto"}
-    config = checkup_report.applied(keys, Config())
+def test_a_change_that_is_applied_has_no_contradictions_or_is_refused() -> None:
+    config = checkup_report.applied({"mcu.baud_rate": 9600, "control.rate": "auto"}, Config())
     assert config is not None
     assert contradictions(config) == []
-
-
-def test_settings_in_use_are_not_removed() -> None:
-    text = b'[mcu]\nlink_check = "on"\nencoder_counts = 3200\n'
-    findings = findings_for(baud_rate=38400, link_check="on", encoder_counts=3200)
-    keys = checkup_report.changes(findings, parse(text))
-    assert keys == {"mcu.baud_rate": 38400, "control.rate": "auto"}
-
-
-def test_a_value_that_its_key_does_not_accept_is_refused() -> None:
     assert checkup_report.applied({"mcu.baud_rate": 300}, Config()) is None
-
-
-def test_the_port_at_which_a_board_answered_is_proposed() -> None:
-    assert checkup_report.changes(findings_for(trailing_comma=True), Config(), "/dev/one") == {
-        "mcu.trailing_comma": True
-    }
-    answered = [Finding("baud rate", "PASS", keys={"mcu.baud_rate": 115200})]
-    assert checkup_report.changes(answered, Config(), "/dev/one") == {"mcu.port": "/dev/one"}
 
 
 class AnyObservation(float):

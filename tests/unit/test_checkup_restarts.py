@@ -9,7 +9,6 @@ import pytest
 from acsard.checkup.motion import ZERO, BoardReply
 from acsard.checkup.procedure import AGAIN, MOST
 from acsard.checkup.restarts import (
-    ANSWER_TIMEOUT_S,
     CLOCK_RANGE_MS,
     RESTART_UNANSWERED_LINES,
     Restart,
@@ -169,16 +168,6 @@ def detector_after(*replies: BoardReply) -> Restarts:
 
 def sign(restart: Restart | None) -> str:
     return "" if restart is None else restart.sign
-
-
-def test_the_name_of_the_board_is_a_restart_unless_it_was_requested() -> None:
-    restarts = detector_after(reply(0.0, 0))
-    restarts.record_request(1.0)
-    assert restarts.check_line(NAME, 1.0 + ANSWER_TIMEOUT_S, None) is None
-    assert (
-        sign(restarts.check_line(NAME, 1.1 + ANSWER_TIMEOUT_S, None))
-        == "the board sent its name without a request"
-    )
 
 
 def test_a_text_is_a_restart_after_a_silence_and_a_debug_print_otherwise() -> None:
