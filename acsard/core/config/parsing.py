@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from codecs import BOM_UTF8
 from typing import Any
 
@@ -55,14 +56,16 @@ def _table(text: bytes) -> dict[str, Any]:
     import tomllib  # it loads for 2 ms, and a computer without a file does not need it
 
     try:
-        return tomllib.loads(text.removeprefix(BOM_UTF8).decode("utf-8"))
+        toml = text.removeprefix(BOM_UTF8).decode("utf-8")
+        return tomllib.loads(toml)
     except UnicodeDecodeError as error:
         raise ConfigError([f"not UTF-8 text: {error}; save the file as UTF-8"]) from None
     except tomllib.TOMLDecodeError as error:
         raise ConfigError(
             [
-                f"not TOML: {error}; write texts in quotes, but true and false without quotes, and "
-                "numbers with a decimal point and no unit: 0.05"
+                _repeated(toml, str(error))
+                or f"not TOML: {error}; write texts in quotes, but true and false without quotes, "
+                "and numbers with a decimal point and no unit: 0.05"
             ]
         ) from None
     # Python limits the length of numbers and the depth of nesting.
@@ -70,6 +73,19 @@ def _table(text: bytes) -> dict[str, Any]:
         raise ConfigError(
             ["not TOML: a number is too long or lists are nested too deep; shorten them"]
         ) from None
+
+
+def _repeated(toml: str, error: str) -> str:
+    # tomllib names the second place only. The last line before it with the same name is the first.
+    if "twice" not in error and "overwrite" not in error:
+        return ""
+    number = re.search(r"line (\d+)", error)
+    lines = toml.rstrip().split("\n")[: int(number[1]) if number else None]
+    *before, name = (line.split("#")[0].split("=")[0].strip() for line in lines)
+    if name not in before:
+        return ""
+    first = len(before) - before[::-1].index(name)
+    return f"line {len(lines)} repeats {name}, which is at line {first} already: change it there"
 
 
 def _checked(table: object) -> Config:
