@@ -15,7 +15,7 @@ from acsard.cli.common import add_config, load
 from acsard.core.config.contradictions import warnings
 from acsard.core.config.parsing import effective
 from acsard.core.config.toml_text import document
-from acsard.core.formatting import json_line
+from acsard.core.formatting import json_line, many
 from acsard.host.errors import MendableError
 from acsard.machine.deploy_files import reference, source
 
@@ -42,8 +42,10 @@ def main(args: argparse.Namespace) -> int:
     else:
         print(f"# effective configuration from {where}")
         print("\n".join(document(plain)))
-    for text in warnings(config):
+    found = warnings(config)
+    for text in found:
         print(f"{where}: warning: {text}", file=sys.stderr)
+    print(f"{where}: no mistakes, {many(len(found), 'warning')}", file=sys.stderr)
     return 0
 
 

@@ -159,6 +159,7 @@ def test_a_good_file_is_printed_with_its_place_and_its_warnings(
     assert out.startswith(f"# effective configuration from {file}\n")
     assert parse(out.encode()) == parse(file.read_bytes())
     assert err.startswith(f"{file}: warning: control.rate = 29 ")
+    assert err.endswith(f"\n{file}: no mistakes, 1 warning\n")
 
 
 @pytest.mark.parametrize("sign", [">", ">>"])
