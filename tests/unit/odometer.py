@@ -6,8 +6,9 @@ import math
 
 from acsard.core.config.settings import DriveConfig, LimitsConfig, OdometryConfig
 from acsard.core.link.feedback import Feedback
+from acsard.core.motion.agreement import claims
 from acsard.core.motion.consistency import ConsistencyChecks
-from acsard.core.motion.gyro import Gyro, claims
+from acsard.core.motion.gyro import Gyro
 from acsard.core.motion.kinematics import Kinematics, on_arc
 from acsard.core.motion.odometry import Odometry
 from acsard.core.motion.uncertainty import ErrorModel

@@ -11,7 +11,8 @@ from hypothesis import strategies as st
 from msgspec.structs import replace
 
 from acsard.core.config.settings import DriveConfig, OdometryConfig
-from acsard.core.motion.gyro import Gyro, claims
+from acsard.core.motion.agreement import claims
+from acsard.core.motion.gyro import Gyro
 from acsard.core.motion.kinematics import Kinematics
 from acsard.core.values import NS_PER_S, GyroDoes, GyroSample
 from tests.each import each

@@ -1,21 +1,18 @@
 """Takes the heading from a gyro while the gyro is fresh and agrees with the wheels.
 
 Only the bias is learned, while the robot rests. The wheels give the heading until the gyro has
-turned as they do, while it is silent, and if it hangs, from the first sample on that it repeated.
-If the two turns differ by more than both claim, the gyro is used and their difference becomes
-uncertainty of the heading, because wheels may slip. A gyro that turns the other way, or by a ratio
-that no floor explains, is not used.
+turned as they do (`agreement.py`), while it is silent, and if it hangs, from the first sample on
+that it repeated. If the two turns differ by more than both claim, the gyro is used and their
+difference becomes uncertainty of the heading, because wheels may slip.
 """
 
 from __future__ import annotations
 
 import math
-from typing import Literal
 
 from msgspec import Struct, field
 
-from acsard.core.config.settings import OdometryConfig
-from acsard.core.motion.kinematics import Kinematics
+from acsard.core.motion.agreement import MARGIN, MAX_DELAY_S, Agreement, Claims, Compared
 from acsard.core.values import (
     NS_PER_S,
     Event,
@@ -30,10 +27,9 @@ from acsard.core.values import (
     Seconds,
 )
 
-# Rest is a zero command and a motion of each side below two counts, or this angle of its wheels if
-# the counts are unknown. Encoders that stand on an edge and filters that never reach zero rest.
+# Rest is a zero command and a motion of each side below `Claims.rest`: encoders that stand on an
+# edge and filters that never reach zero rest.
 REST_S = 0.2
-REST_COUNTS, REST_ANGLE = 2, 0.05
 
 # At rest, until a bias is known: without a higher rate (rad/s), which is a person who turns the
 # robot, or a gyro whose noise makes it useless.
@@ -59,24 +55,6 @@ MAX_JUMP, CONFIRMED = 0.5, 0.5
 # this share of its samples, so that such a series has less than this probability.
 HANG_S, MAX_REPEATING, MIN_CHANCE = 0.5, 0.6, 1e-6
 
-BLOCK_S, MAX_BLOCK = 0.2, 0.5  # s, or rad of difference: of the sums that are compared
-# Old blocks count less: on straights after this time, and in turns after this angle.
-STRAIGHT_MEMORY_S, TURN_MEMORY = 30.0, 10.0
-AGREES = 0.5  # deviations, below which a short comparison restarts: a new fault then shows at once
-MARGIN = 0.02  # rad, standard deviation of the wheels' turn by encoder counts and vibration
-MAX_DELAY_S = 0.05  # a gyro with this delay does not contradict the wheels
-DEVIATIONS = 3.0  # of what both claim; more is a contradiction
-DISAGREES_S = 5.0  # after a contradiction
-
-# True turn divided by the turn of the wheels, on any floor.
-MIN_RATIO, MAX_RATIO = 0.25, 2.5
-MIN_TURN_RATE = 0.1  # rad/s of the wheels; less may be a count, or unequal tyres on a straight
-# Turns by the wheels, rad, that prove a gyro, and refute it. A gyro in use must prove itself again
-# if it turns the other way, or by this angle more than the wheels on any floor. If it turns less,
-# the wheels may spin on the spot.
-PROVING_TURN, REFUTING_TURN, MAX_MORE = 0.1, 0.4, 0.3
-MIN_DEGREES_RATIO, MAX_DEGREES_RATIO = 15.0, 150.0  # 57 without slip and errors
-
 STATUS_TEXTS: dict[GyroDoes, str] = {
     "off": "",
     "waiting for rest": "the gyro's bias is not known yet: the robot must stand for "
@@ -100,30 +78,6 @@ STATUS_TEXTS: dict[GyroDoes, str] = {
     "not believed": "the gyro is not used, because it measures much larger turns than the wheels: "
     "does its z axis point up, does it send rad/s, and has its bias changed?",
 }
-
-Verdict = Literal["none yet", "good", "reversed", "in degrees", "dead", "not believed"]
-
-
-class Claims(Struct, frozen=True, gc=False):
-    """What the settings say about the turn of the wheels, and the motion of a side at rest."""
-
-    per_metre: float
-    per_radian: float
-    scale: float  # share of a turn, of the track and of the gyro
-    rest: Metres
-    half_track: Metres
-
-
-def claims(odometry: OdometryConfig, kinematics: Kinematics, counts: int) -> Claims:
-    rest = REST_COUNTS * math.tau / counts if counts else REST_ANGLE
-    track = odometry.wheel_separation_multiplier_std / kinematics.multipliers[2]
-    return Claims(
-        odometry.yaw_variance_per_metre,
-        odometry.yaw_variance_per_radian,
-        math.hypot(odometry.gyro_scale_std, track),
-        rest * kinematics.radius,
-        kinematics.track / 2,
-    )
 
 
 class Turn(Struct, frozen=True, gc=False):
@@ -182,31 +136,11 @@ class Bias(Struct):
         return True
 
 
-class Compared(Struct):
-    """Sums of lines with turns by both, of which old ones count less."""
-
-    wheels: Rad = 0.0
-    gyro: Rad = 0.0
-    turned: Rad = 0.0  # by the wheels, to either side
-    way: Metres = 0.0
-    seconds: Seconds = 0.0
-    noise: float = 0.0  # of the gyro, rad2
-
-    def add(self, block: Compared, share: float) -> None:
-        self.wheels = share * self.wheels + block.wheels
-        self.gyro = share * self.gyro + block.gyro
-        self.turned = share * self.turned + abs(block.wheels)
-        self.way = share * self.way + block.way
-        self.seconds = share * self.seconds + block.seconds
-        self.noise = share * self.noise + block.noise
-
-
 class Gyro(Struct):
     """The turns of the robot by the samples of one gyro."""
 
     does: GyroDoes = "silent"
     reported: GyroDoes = "silent"
-    verdict: Verdict = "none yet"
     bias: Bias = field(default_factory=Bias)
     used: bool = False  # for the last line
 
@@ -241,11 +175,7 @@ class Gyro(Struct):
     rest_way: Metres = 0.0
     since_rest_s: Seconds = 0.0
 
-    block: Compared = field(default_factory=Compared)
-    straight: Compared = field(default_factory=Compared)
-    short: Compared = field(default_factory=Compared)  # turns; the trial of a gyro, too
-    long: Compared = field(default_factory=Compared)
-    disagrees_s: Seconds = 0.0  # left
+    agreement: Agreement = field(default_factory=Agreement)
     learn_again: bool = False  # the bias, at the next rest: it may have changed
     doubt: Rad = 0.0  # for the next turn
 
@@ -267,11 +197,7 @@ class Gyro(Struct):
     def forget_doubt(self) -> None:
         """Forget the uncertainty of turns before now: a new pose was set."""
         self.doubt = self.since_sample = self.since_change = 0.0
-        self.block = Compared()
-        self._forget_compared()
-
-    def _forget_compared(self) -> None:
-        self.straight, self.short, self.long = Compared(), Compared(), Compared()
+        self.agreement.forget()
 
     # Samples.
 
@@ -388,21 +314,12 @@ class Gyro(Struct):
         total = self.turned + self.rate * ahead_ns / NS_PER_S
         angle, self.given = total - self.given, total
         known = self.bias.is_known
+        agreement = self.agreement
         if dt > 0.0 and not (silent or self.hangs):
-            block = self.block
-            block.wheels += wheels
-            block.gyro += angle
-            block.way += abs(way)
-            block.seconds += dt
-            block.noise += self.variance
-            off = block.gyro - block.wheels
-            if block.seconds >= BLOCK_S * 0.95 or abs(off) > MAX_BLOCK:
-                self.block = Compared()
-                if self.verdict == "good":
-                    self._compare(block, claims)
-                else:
-                    self._try(block, known)
-        self.disagrees_s = max(0.0, self.disagrees_s - dt)
+            block = agreement.add(wheels, angle, way, dt, self.variance)
+            if block is not None:
+                self._compare(block, claims, known)
+        agreement.disagrees_s = max(0.0, agreement.disagrees_s - dt)
         self._judge(silent, known)
         if self.does not in ("used", "disagrees"):
             return self._wheels(dt, wheels, claims)
@@ -419,7 +336,7 @@ class Gyro(Struct):
         variance = self.variance + 2.0 * bias.shared * dt
         if self.rate:
             bias.shared += bias.variance * dt
-        rate_variance, disagrees = bias.noise + bias.variance, self.disagrees_s > 0.0
+        rate_variance, disagrees = bias.noise + bias.variance, agreement.disagrees_s > 0.0
         if disagrees and dt > 0.0:
             rate_variance += ((angle - wheels) / dt) ** 2
         doubt, self.doubt, self.variance = self.doubt, 0.0, 0.0
@@ -452,8 +369,19 @@ class Gyro(Struct):
         if not idle or moved > claims.rest:
             self.rest_s = self.rest_turn = self.rest_way = 0.0
 
+    def _compare(self, block: Compared, claims: Claims, known: bool) -> None:
+        agreement = self.agreement
+        if agreement.verdict != "good":
+            agreement.test(block, known)
+            return
+        if self.rest_s > REST_S and abs(block.gyro) >= MAX_BIAS * block.seconds:
+            return  # a person turns the robot, which the wheels do not measure
+        contradiction, doubt = agreement.compare(block, claims, self.bias.variance)
+        self.learn_again |= contradiction
+        self.doubt += doubt
+
     def _judge(self, silent: bool, known: bool) -> None:
-        verdict = self.verdict
+        verdict = self.agreement.verdict
         if verdict != "none yet" and verdict != "good":
             self.does = verdict
         elif silent:
@@ -465,67 +393,7 @@ class Gyro(Struct):
         elif verdict == "none yet":
             self.does = "waiting for turn"
         else:
-            self.does = "disagrees" if self.disagrees_s > 0.0 else "used"
-
-    # Comparison with the wheels.
-
-    def _try(self, block: Compared, known: bool) -> None:
-        trial = self.short
-        if abs(block.wheels) < MIN_TURN_RATE * block.seconds or block.wheels * trial.wheels < 0.0:
-            # On a straight, and as the robot begins to turn to the other side, the trial restarts.
-            self.short = Compared()
-            return
-        trial.add(block, 1.0)
-        ratio = trial.gyro / trial.wheels
-        if MIN_RATIO <= ratio <= MAX_RATIO:
-            if known and trial.turned >= PROVING_TURN:
-                self.verdict = "good"
-        elif trial.turned >= REFUTING_TURN:
-            verdict, self.short = _named(ratio), Compared()
-            if known or verdict == "in degrees":
-                self.verdict = verdict
-
-    def _compare(self, block: Compared, claims: Claims) -> None:
-        if self.rest_s > REST_S and abs(block.gyro) >= MAX_BIAS * block.seconds:
-            return  # a person turns the robot, which the wheels do not measure
-        turned = abs(block.wheels)
-        if turned < MIN_TURN_RATE * block.seconds:
-            compared, lag = self.straight, 0.0
-            compared.add(block, math.exp(-block.seconds / STRAIGHT_MEMORY_S))
-        else:
-            compared, lag = self.long, MAX_DELAY_S * turned / block.seconds
-            compared.add(block, math.exp(-turned / TURN_MEMORY))
-            self.short.add(block, 1.0)
-            off, std = self._difference(self.short, claims)
-            if off <= AGREES * std:
-                self.short = Compared()
-            elif off > DEVIATIONS * std + lag:
-                compared = self.short
-        off, std = self._difference(compared, claims)
-        contradiction = off > DEVIATIONS * std + lag
-        if self.disagrees_s > 0.0:
-            self.doubt += block.gyro - block.wheels
-        elif contradiction:
-            self.doubt += compared.gyro - compared.wheels
-        if contradiction:
-            self.disagrees_s, self.learn_again = DISAGREES_S, True
-            wheels, gyro = abs(compared.wheels), abs(compared.gyro)
-            opposite = compared.gyro * compared.wheels < 0.0 and wheels > 2.0 * MARGIN
-            if (opposite and gyro > MIN_RATIO * wheels) or gyro > MAX_RATIO * wheels + MAX_MORE:
-                self.verdict, self.disagrees_s = "none yet", 0.0
-            self._forget_compared()
-
-    def _difference(self, compared: Compared, claims: Claims) -> tuple[Rad, Rad]:
-        # Returns the size of the difference of the turns, and the deviation that both claim.
-        variance = (
-            MARGIN**2
-            + claims.per_metre * compared.way
-            + claims.per_radian * compared.turned
-            + (claims.scale * compared.wheels) ** 2
-            + self.bias.variance * compared.seconds**2
-            + compared.noise
-        )
-        return abs(compared.gyro - compared.wheels), math.sqrt(variance)
+            self.does = "disagrees" if self.agreement.disagrees_s > 0.0 else "used"
 
 
 def _span(last: GyroSample, sample: GyroSample) -> Seconds:
@@ -536,11 +404,3 @@ def _span(last: GyroSample, sample: GyroSample) -> Seconds:
             return span_ns / NS_PER_S
     span_ns = sample.at_ns - last.at_ns
     return span_ns / NS_PER_S if span_ns < SILENCE_TIMEOUT_NS else 0.0
-
-
-def _named(ratio: float) -> Verdict:
-    if MIN_DEGREES_RATIO <= abs(ratio) <= MAX_DEGREES_RATIO:
-        return "in degrees"
-    if -MAX_RATIO <= ratio <= -MIN_RATIO:
-        return "reversed"
-    return "dead" if abs(ratio) < MIN_RATIO else "not believed"

@@ -22,7 +22,7 @@ from msgspec import Struct, field
 
 from acsard.core.config.settings import FeedbackConfig, LimitsConfig, OdometryConfig
 from acsard.core.link.feedback import MAX_FILLED_GAP_S
-from acsard.core.motion.gyro import claims
+from acsard.core.motion.agreement import claims
 from acsard.core.motion.kinematics import Kinematics
 from acsard.core.motion.wheels import count_angle
 from acsard.core.values import (

@@ -1,0 +1,181 @@
+"""Decides whether a gyro turns as the wheels do, over blocks of 0.2 s.
+
+A gyro is tested in its first turn. One in use is compared over some seconds, and contradicts the
+wheels if the turns differ by more than both claim; it is tested again if it turns the other way, or
+by a ratio that no floor explains.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Literal
+
+from msgspec import Struct, field
+
+from acsard.core.config.settings import OdometryConfig
+from acsard.core.motion.kinematics import Kinematics
+from acsard.core.values import Metres, Rad, Seconds
+
+# Motion of each side below which a robot rests: counts, or an angle of its wheels if the counts are
+# unknown.
+REST_COUNTS, REST_ANGLE = 2, 0.05
+
+BLOCK_S, MAX_BLOCK = 0.2, 0.5  # s, or rad of difference: of the sums that are compared
+# Old blocks count less: on straights after this time, and in turns after this angle.
+STRAIGHT_MEMORY_S, TURN_MEMORY = 30.0, 10.0
+AGREES = 0.5  # deviations, below which a short comparison restarts: a new fault then shows at once
+MARGIN = 0.02  # rad, standard deviation of the wheels' turn by encoder counts and vibration
+MAX_DELAY_S = 0.05  # a gyro with this delay does not contradict the wheels
+DEVIATIONS = 3.0  # of what both claim; more is a contradiction
+DISAGREES_S = 5.0  # after a contradiction
+
+# True turn divided by the turn of the wheels, on any floor.
+MIN_RATIO, MAX_RATIO = 0.25, 2.5
+MIN_TURN_RATE = 0.1  # rad/s of the wheels; less may be a count, or unequal tyres on a straight
+# Turns by the wheels, rad, that prove a gyro, and refute it. A gyro in use must prove itself again
+# if it turns the other way, or by this angle more than the wheels on any floor. If it turns less,
+# the wheels may spin on the spot.
+PROVING_TURN, REFUTING_TURN, MAX_MORE = 0.1, 0.4, 0.3
+MIN_DEGREES_RATIO, MAX_DEGREES_RATIO = 15.0, 150.0  # 57 without slip and errors
+
+Verdict = Literal["none yet", "good", "reversed", "in degrees", "dead", "not believed"]
+
+
+class Claims(Struct, frozen=True, gc=False):
+    """What the settings say about the turn of the wheels, and the motion of a side at rest."""
+
+    per_metre: float
+    per_radian: float
+    scale: float  # share of a turn, of the track and of the gyro
+    rest: Metres
+    half_track: Metres
+
+
+def claims(odometry: OdometryConfig, kinematics: Kinematics, counts: int) -> Claims:
+    rest = REST_COUNTS * math.tau / counts if counts else REST_ANGLE
+    track = odometry.wheel_separation_multiplier_std / kinematics.multipliers[2]
+    return Claims(
+        odometry.yaw_variance_per_metre,
+        odometry.yaw_variance_per_radian,
+        math.hypot(odometry.gyro_scale_std, track),
+        rest * kinematics.radius,
+        kinematics.track / 2,
+    )
+
+
+class Compared(Struct):
+    """Sums of lines with turns by both, of which old ones count less."""
+
+    wheels: Rad = 0.0
+    gyro: Rad = 0.0
+    turned: Rad = 0.0  # by the wheels, to either side
+    way: Metres = 0.0
+    seconds: Seconds = 0.0
+    noise: float = 0.0  # of the gyro, rad2
+
+    def add(self, block: Compared, share: float) -> None:
+        self.wheels = share * self.wheels + block.wheels
+        self.gyro = share * self.gyro + block.gyro
+        self.turned = share * self.turned + abs(block.wheels)
+        self.way = share * self.way + block.way
+        self.seconds = share * self.seconds + block.seconds
+        self.noise = share * self.noise + block.noise
+
+    def difference(self, claims: Claims, bias_variance: float) -> tuple[Rad, Rad]:
+        """Return the size of the difference of the turns, and the deviation that both claim."""
+        variance = (
+            MARGIN**2
+            + claims.per_metre * self.way
+            + claims.per_radian * self.turned
+            + (claims.scale * self.wheels) ** 2
+            + bias_variance * self.seconds**2
+            + self.noise
+        )
+        return abs(self.gyro - self.wheels), math.sqrt(variance)
+
+
+class Agreement(Struct):
+    verdict: Verdict = "none yet"
+    disagrees_s: Seconds = 0.0  # left
+    block: Compared = field(default_factory=Compared)
+    straight: Compared = field(default_factory=Compared)
+    short: Compared = field(default_factory=Compared)  # turns; the test of a gyro, too
+    long: Compared = field(default_factory=Compared)
+
+    def forget(self) -> None:
+        """Forget what was compared; the verdict stays."""
+        self.block = Compared()
+        self._forget_turns()
+
+    def _forget_turns(self) -> None:
+        self.straight, self.short, self.long = Compared(), Compared(), Compared()
+
+    def add(
+        self, wheels: Rad, gyro: Rad, way: Metres, dt: Seconds, noise: float
+    ) -> Compared | None:
+        """Add the turns of a line, and return the block that it ends."""
+        block = self.block
+        block.wheels += wheels
+        block.gyro += gyro
+        block.way += abs(way)
+        block.seconds += dt
+        block.noise += noise
+        if block.seconds < BLOCK_S * 0.95 and abs(block.gyro - block.wheels) <= MAX_BLOCK:
+            return None
+        self.block = Compared()
+        return block
+
+    def test(self, block: Compared, known: bool) -> None:
+        """Test a gyro that is not in use; `known`: its bias is."""
+        trial = self.short
+        if abs(block.wheels) < MIN_TURN_RATE * block.seconds or block.wheels * trial.wheels < 0.0:
+            # On a straight, and as the robot begins to turn to the other side, the trial restarts.
+            self.short = Compared()
+            return
+        trial.add(block, 1.0)
+        ratio = trial.gyro / trial.wheels
+        if MIN_RATIO <= ratio <= MAX_RATIO:
+            if known and trial.turned >= PROVING_TURN:
+                self.verdict = "good"
+        elif trial.turned >= REFUTING_TURN:
+            verdict, self.short = _named(ratio), Compared()
+            if known or verdict == "in degrees":
+                self.verdict = verdict
+
+    def compare(self, block: Compared, claims: Claims, bias_variance: float) -> tuple[bool, Rad]:
+        """Return whether the gyro contradicts the wheels now, and by how much the turn may err."""
+        turned = abs(block.wheels)
+        if turned < MIN_TURN_RATE * block.seconds:
+            compared, lag = self.straight, 0.0
+            compared.add(block, math.exp(-block.seconds / STRAIGHT_MEMORY_S))
+        else:
+            compared, lag = self.long, MAX_DELAY_S * turned / block.seconds
+            compared.add(block, math.exp(-turned / TURN_MEMORY))
+            self.short.add(block, 1.0)
+            off, std = self.short.difference(claims, bias_variance)
+            if off <= AGREES * std:
+                self.short = Compared()
+            elif off > DEVIATIONS * std + lag:
+                compared = self.short
+        off, std = compared.difference(claims, bias_variance)
+        contradiction, doubt = off > DEVIATIONS * std + lag, 0.0
+        if self.disagrees_s > 0.0:
+            doubt = block.gyro - block.wheels
+        elif contradiction:
+            doubt = compared.gyro - compared.wheels
+        if contradiction:
+            self.disagrees_s = DISAGREES_S
+            wheels, gyro = abs(compared.wheels), abs(compared.gyro)
+            opposite = compared.gyro * compared.wheels < 0.0 and wheels > 2.0 * MARGIN
+            if (opposite and gyro > MIN_RATIO * wheels) or gyro > MAX_RATIO * wheels + MAX_MORE:
+                self.verdict, self.disagrees_s = "none yet", 0.0
+            self._forget_turns()
+        return contradiction, doubt
+
+
+def _named(ratio: float) -> Verdict:
+    if MIN_DEGREES_RATIO <= abs(ratio) <= MAX_DEGREES_RATIO:
+        return "in degrees"
+    if -MAX_RATIO <= ratio <= -MIN_RATIO:
+        return "reversed"
+    return "dead" if abs(ratio) < MIN_RATIO else "not believed"
