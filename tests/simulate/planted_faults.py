@@ -361,8 +361,8 @@ FAULTS = (
           "elif goes_on and abs(speed) >= AGREEMENT * abs(command):", "elif False:"),
     # bus
     fault("bus reasons", "a message that is too big is counted as one that cannot be read",
-          COMMANDS, 'raise DecodeError("too_big", f"{len(arrival.payload)} bytes are',
-          'raise DecodeError("malformed", f"{len(arrival.payload)} bytes are'),
+          COMMANDS, '"too_big", f"{len(arrival.payload)} bytes are too many for a command"',
+          '"malformed", f"{len(arrival.payload)} bytes are too many for a command"'),
     fault("bus answers", "a call that is refused has no answer", PUBLICATION,
           "            if reply is not None:\n                self.bus.reply(reply)\n"
           "                self.bus.retire",
