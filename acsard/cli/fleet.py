@@ -61,8 +61,6 @@ def main(args: argparse.Namespace) -> int:
             raise UnreachableError("; ".join(filter(None, (fleet.hint(), silence))))
     lost = [row.robot_id for row in rows if row.robot_id in ids and absence(row)]
     lost_text = f"gone or silent: {', '.join(lost)}" if lost else ""
-    texts = fleet.presence_text, lost_text, fleet.left_out_text
-    for text in texts[1:] if args.json else texts:
-        if text:
-            print(f"acsard: {text}", file=sys.stderr)
+    for text in filter(None, ("" if args.json else fleet.presence_text, lost_text)):
+        print(f"acsard: {text}", file=sys.stderr)
     return Exit.UNREACHABLE if lost else Exit.OK

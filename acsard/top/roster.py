@@ -26,8 +26,6 @@ from acsard.core.messages.schema import RobotState
 from acsard.host import clock
 from acsard.host.mailbox import Mailbox
 
-MAX_ROBOTS = 1000  # any client of the bus can invent robot ids
-
 
 class Row(Struct, frozen=True):
     robot_id: str
@@ -51,44 +49,39 @@ class _TrackedRobot:
         self.begin()
 
     def begin(self) -> None:
-        self.since = clock.steady_s()
-        self.follower = Follower(self.since, FLEET_QUERY_PERIOD_S)
-        self.follower.due = self.since
+        now = clock.steady_s()
+        self.follower = Follower(now, FLEET_QUERY_PERIOD_S)
+        self.follower.due = now
 
 
 class Roster:
     """Follows several robots, or all robots on the bus, and says why some may be missing."""
 
-    def __init__(self, robot: Connection, ids: Sequence[str], most: int = MAX_ROBOTS) -> None:
-        # Raises `ZError`. "*" in `ids` is all robots. Beyond `most`, a new robot replaces an absent
-        # one that `ids` does not name, or is left out.
-        self._robot, self._ids, self._most = robot, ids, most
-        self._lock = Lock()
-        self.left_out = False  # a robot, because of `most`
+    def __init__(self, robot: Connection, ids: Sequence[str]) -> None:
+        # Raises `ZError`. "*" in `ids` is all robots.
+        self._robot, self._ids, self._lock = robot, ids, Lock()
         self._known = {robot_id: _TrackedRobot() for robot_id in ids if robot_id != ALL_ROBOTS}
         self._states = Decoder(RobotState)
         self._declared: list[Any] = []
         session, liveliness = robot.session, robot.session.liveliness()
-        try:
-            for robot_id in ids:
-                states, tokens = full_key(robot_id, "state"), full_key(robot_id, "alive")
-                self._declared += [
-                    session.declare_subscriber(states, self._state),
-                    liveliness.declare_subscriber(tokens, self._token, history=True),
-                ]
-        except zenoh.ZError:
-            self.end()
-            raise
+        for robot_id in ids:
+            states, tokens = full_key(robot_id, "state"), full_key(robot_id, "alive")
+            self._declared += [
+                session.declare_subscriber(states, self._state),
+                liveliness.declare_subscriber(tokens, self._token, history=True),
+            ]
 
     def rows(self) -> list[Row]:
-        """Return a row for each robot, after queries of the states that are due."""
-        for name in self._due():
-            self._robot.sibling(name).start_query("state", self._answer)
+        """Return a row for each robot, and query the states that are due."""
         now = clock.steady_s()
         with self._lock:
             for robot in self._known.values():
                 self._take(robot)
-            return [self._row(name, robot, now) for name, robot in self._known.items()]
+            due = [name for name, robot in self._known.items() if robot.follower.query_is_due(now)]
+            rows = [self._row(name, robot, now) for name, robot in self._known.items()]
+        for name in due:
+            self._robot.sibling(name).start_query("state", self._answer)
+        return rows
 
     def gather(self) -> list[Row]:
         """Wait for the first reports, and return one row per robot.
@@ -100,20 +93,15 @@ class Roster:
         began, rows = time.monotonic(), self.rows()
         while (passed := time.monotonic() - began) < 3.0:
             present = any(row.here or row.state for row in rows)
-            if present and self.all_reported and (passed >= 1.5 or ALL_ROBOTS not in self._ids):
+            if present and self._all_reported() and (passed >= 1.5 or ALL_ROBOTS not in self._ids):
                 break
             time.sleep(0.05)
             rows = self.rows()
         return [replace(row, silent=True) if math.isinf(row.age) else row for row in rows]
 
-    @property
-    def all_reported(self) -> bool:
-        """Whether all robots that the user named have reported."""
-        with self._lock:
-            named = [self._known.get(name) for name in self._ids if name != ALL_ROBOTS]
-        return all(
-            robot is not None and robot.here and robot.follower.is_confirmed for robot in named
-        )
+    def _all_reported(self) -> bool:
+        named = [self._known[name] for name in self._ids if name != ALL_ROBOTS]
+        return all(robot.here and robot.follower.is_confirmed for robot in named)
 
     @property
     def presence_text(self) -> str:
@@ -121,16 +109,6 @@ class Roster:
         with self._lock:
             here = sum(robot.here for robot in self._known.values())
         return count_text(self._robot.where.endpoint, here) if ALL_ROBOTS in self._ids else ""
-
-    @property
-    def left_out_text(self) -> str:
-        """That the table leaves out some robots, or ""."""
-        if not self.left_out:
-            return ""
-        return (
-            f"there are more than {self._most} robots, and this list shows only {self._most} "
-            "of them: to choose the robots, use --id robot1,robot2"
-        )
 
     def hint(self) -> str:
         """Return why no robot is there."""
@@ -140,18 +118,6 @@ class Roster:
             f"none of these robots is visible at {self._robot.where.endpoint}: start their daemons,"
             " or correct --id or [fleet] robots"
         )
-
-    def end(self) -> None:
-        """Unsubscribe from all robots. This may wait for the bus. Raises `ZError`."""
-        for subscriber in self._declared:
-            subscriber.undeclare()
-
-    def _due(self) -> list[str]:
-        now = clock.steady_s()
-        with self._lock:
-            for robot in self._known.values():
-                self._take(robot)
-            return [name for name, robot in self._known.items() if robot.follower.query_is_due(now)]
 
     def _row(self, name: str, robot: _TrackedRobot, now: float) -> Row:
         follower, state = robot.follower, robot.follower.state
@@ -174,27 +140,13 @@ class Roster:
     def _of(self, sample: zenoh.Sample) -> _TrackedRobot | None:
         name = robot_of(str(sample.key_expr))
         with self._lock:
-            if name not in self._known and name:
-                if len(self._known) >= self._most:
-                    self._forget_one()
-                if len(self._known) < self._most:
-                    self._known[name] = _TrackedRobot()
-                else:
-                    self.left_out = True
-            return self._known.get(name)
-
-    def _forget_one(self) -> None:
-        candidates = [(entry.since, name) for name, entry in self._known.items() if not entry.here]
-        for _, name in sorted(entry for entry in candidates if entry[1] not in self._ids)[:1]:
-            del self._known[name]
+            return self._known.setdefault(name, _TrackedRobot()) if name else None
 
     def _token(self, sample: zenoh.Sample) -> None:
         robot = self._of(sample)
         if robot is not None:
             appeared, robot.here = not robot.here, sample.kind == zenoh.SampleKind.PUT
-            if not robot.here:
-                robot.since = clock.steady_s()
-            elif appeared:
+            if robot.here and appeared:
                 robot.begin()
 
     def _state(self, sample: zenoh.Sample) -> None:

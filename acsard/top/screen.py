@@ -43,9 +43,6 @@ LINK_STYLES = {"up": "bold green", "booting": "bold yellow"}
 # Cells of the tables on the left, with the gap, and on the right.
 PAIR_WIDTHS = 40, 40
 
-# Of the lines that a hostile message could make.
-MAX_SOURCES, MAX_REASONS = 32, 16
-
 
 class ScreenData(Struct, frozen=True):
     """What the screen of `acsard top` shows. Rates compare `state` with the earlier `before`."""
@@ -204,7 +201,7 @@ def _sources(state: RobotState) -> Table:
             "-" if source.age is None else rough(source.age),
             _waits(source, state),
         )
-        for source in state.sources[:MAX_SOURCES]
+        for source in state.sources
     ]
     return _table(("sources", "priority", "seen", "waits for"), rows, (1, 2))
 
@@ -259,7 +256,7 @@ def _rejected(state: RobotState, before: RobotState) -> Text:
                 f"{clean(name.removeprefix(prefix)).replace('_', ' ')} {number:,}",
                 "yellow" if number > before.counters.get(name, 0) else "",
             )
-            for name, number in counters[:MAX_REASONS]
+            for name, number in counters
         ]
         if parts:
             kinds.append(Text(f"{kind} ").append_text(Text(", ").join(parts)))

@@ -98,7 +98,7 @@ def roster(fleet: Roster) -> None:
 
     def draw(width: int, height: int) -> RenderableType:
         rows = fleet.rows()
-        below = f"q quits   {fleet.left_out_text or fleet.presence_text}" if rows else fleet.hint()
+        below = f"q quits   {fleet.presence_text}" if rows else fleet.hint()
         last = Text(below.rstrip(), "dim", no_wrap=bool(rows), overflow="ellipsis")
         return Group(table(rows, width, max(1, height - 4)), Text(), last)
 

@@ -75,31 +75,7 @@ def fleet_of(
         if name in answering:
             take(sample_of(replace(STATE, stamp=Time(next(stamps))), f"acsard/{name}/{key}"))
 
-    return Roster(robot, ids, most=3)
-
-
-def test_robots_beyond_the_limit_are_reported_as_left_out(session: Session) -> None:
-    fleet = fleet_of(session)
-    for number in range(3):
-        session.announce(f"robot{number}")
-    assert fleet.left_out_text == ""
-    assert fleet.presence_text == "all robots visible at tcp/127.0.0.1:7448: 3 robots"
-    session.announce("robot3")
-    assert [row.robot_id for row in fleet.rows()] == ["robot0", "robot1", "robot2"]
-    assert "more than 3 robots, and this list shows only 3 of them" in fleet.left_out_text
-    assert "--id" in fleet.left_out_text
-
-
-def test_the_robot_gone_longest_makes_room_for_a_new_one(session: Session, clock: Clock) -> None:
-    fleet = fleet_of(session, ("robot0", "*"))
-    for number in range(3):
-        session.announce(f"robot{number}")
-    for name in ("robot0", "robot2", "robot1"):
-        clock.now += 1.0
-        session.announce(name, zenoh.SampleKind.DELETE)
-    session.announce("robot3")
-    assert sorted(row.robot_id for row in fleet.rows()) == ["robot0", "robot1", "robot3"]
-    assert fleet.left_out_text == ""
+    return Roster(robot, ids)
 
 
 @pytest.mark.parametrize(
@@ -117,14 +93,14 @@ def test_the_fleet_is_complete_once_each_named_robot_is_present_and_has_answered
     here: Sequence[str], whole: bool,
 ) -> None:  # fmt: skip
     fleet = fleet_of(session, ids, answering)
-    assert not fleet.all_reported
+    assert not fleet._all_reported()
     for name in here:
         session.announce(name)
     # the first query may be answered by a storage, the second one only by the robot
     for _ in range(2):
         fleet.rows()
         clock.now += FLEET_QUERY_PERIOD_S
-    assert fleet.all_reported is whole
+    assert fleet._all_reported() is whole
 
 
 class Remembers:
