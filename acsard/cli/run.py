@@ -181,8 +181,6 @@ def page(config: Config, where: str) -> list[str] | None:
         words += ["--config", where]
     if config.bus.plain:
         words += ["--connect", reachable(config.bus.plain[0])]
-    if config.record.directory:
-        words += [f"--record={config.record.directory}"]
     return words
 
 

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 
 from acsard.bus.address import address_of
 from acsard.bus.zenoh_sessions import log_from_environment
-from acsard.cli.common import load, whole, with_record_directory
+from acsard.cli.common import load, whole
 from acsard.cli.robot_options import add_bus
 from acsard.core.config.settings import Config
 from acsard.core.formatting import lasting
@@ -38,12 +38,6 @@ NAME = re.compile(r"[A-Za-z0-9_.-]{1,32}\Z")
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     _add_place(parser, None)
-    parser.add_argument(
-        "--record",
-        metavar="DIRECTORY",
-        help="directory of the recordings that the page lists. If the robot reports its own "
-        "directory, the page uses that one (default: record.directory)",
-    )
     parser.add_argument("--supervised", action="store_true", help=argparse.SUPPRESS)
     actions = parser.add_subparsers(title="subcommands", metavar="SUBCOMMAND")
     invite = actions.add_parser(
@@ -110,9 +104,7 @@ def _loaded(args: argparse.Namespace) -> tuple[str, Config]:
         import segno  # noqa: F401
     except ImportError:
         raise missing("aiohttp, prometheus-client or segno") from None
-    options = {"record.directory": args.record or None, "bus.tls": args.tls or None}
-    where, config = load(args.config, options)
-    return where, with_record_directory(config)
+    return load(args.config, {"bus.tls": args.tls or None})
 
 
 def places(

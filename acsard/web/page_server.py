@@ -173,7 +173,7 @@ def _about(options: ServerOptions) -> About:
         config.limits.linear_speed,
         config.limits.angular_speed,
         config.rates.state_hz,
-        config.record.directory,
+        "",
         {source.name: source.timeout for source in config.commands.sources},
     )
 
