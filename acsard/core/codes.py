@@ -268,7 +268,7 @@ set_points
 no_checksum
     the microcontroller answers without a checksum, but mcu.link_check = "on" lets the robot drive
     only with one:
-    -> flash the firmware of deploy/firmware, or write mcu.link_check = "off"
+    -> flash the C firmware of deploy/firmware, or write mcu.link_check = "off"
 replies_damaged
     the microcontroller's replies arrive damaged:
     -> check cable and ground
@@ -320,7 +320,7 @@ encoder_counts_wrong
 coarse_encoder
     the encoders are coarse, and lines get lost or come after varying delays, so the pose may be far
     off:
-    -> flash the firmware of deploy/firmware, and write mcu.link_check = "on" and
+    -> flash the C firmware of deploy/firmware, and write mcu.link_check = "on" and
     mcu.encoder_counts: its lines have counts, which no lost or late line can falsify
 
 unknown_source
