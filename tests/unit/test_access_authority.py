@@ -67,6 +67,12 @@ def test_a_certificate_is_valid_for_a_permitted_name_only(
     assert connects(where, tmp_path / name, name, tmp_path / "client") == (name in PERMITTED)
 
 
+def test_the_constraints_are_critical(authority: tuple[Authority, Path]) -> None:
+    certificate = x509.load_pem_x509_certificate((authority[1] / "ca.pem").read_bytes())
+    extension = certificate.extensions.get_extension_for_class(x509.NameConstraints)
+    assert extension.critical
+
+
 def test_an_authority_of_another_program_without_constraints_may_sign_for_any_name(
     authority: tuple[Authority, Path], tmp_path: Path
 ) -> None:

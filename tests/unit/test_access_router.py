@@ -131,6 +131,15 @@ def test_each_commanding_certificate_has_keys_of_its_own_on_each_robot(robots: l
         assert policy["subjects"] == [f"certificate {name}"]
 
 
+def test_a_robot_may_have_a_name_that_the_template_uses_otherwise() -> None:
+    robots = ["viewers", "hear", "learn", "a", "see-a", "own-a", "robot-a"]
+    access = router_config(robots)
+    for kind in ("rules", "subjects"):
+        ids = [entry["id"] for entry in access[kind]]
+        assert len(set(ids)) == len(ids)
+    assert len(access["storages"]) == 3 * len(robots)
+
+
 @each(
     ("robots", "people"),
     [

@@ -113,6 +113,17 @@ def test_the_newest_displaced_command_of_each_sender_is_returned_for_16_senders(
     assert lost == {f"session {number}": 40 + number for number in range(MAX_DISPLACED)}
 
 
+@pytest.mark.parametrize(("rate_hz", "room"), [(10.0, 160), (20.0, 80), (100.0, 16), (300.0, 16)])
+def test_a_slow_control_rate_has_larger_buffers_so_that_a_lawful_sender_loses_nothing(
+    rate_hz: float, room: int
+) -> None:
+    inbox, _ = an_inbox(rate_hz)
+    arrived(inbox, *["cmd/app"] * room)
+    assert inbox.take(8).overrun == 0
+    arrived(inbox, *["cmd/app"] * (room + 1))
+    assert inbox.take(8).overrun == 1
+
+
 class FakeQuery:
     """A stand-in for a Zenoh query. It records its replies and whether the daemon dropped it."""
 

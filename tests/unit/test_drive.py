@@ -116,6 +116,19 @@ def test_a_stall_adds_at_most_50_ms_of_acceleration_or_one_and_a_half_periods() 
     assert rig.path(1, GO, ms=240) == near(0.05)
 
 
+def test_a_line_superseded_before_the_port_was_lost_does_not_bring_its_speed_back() -> None:
+    for ticks in ((True,) * 3, (True, True, True, False, False)):
+        rig = Rig().driving()
+        rig.step(GO)  # this line does not leave
+        rig.replug()
+        assert rig.step(GO, superseded=True).applied == REST
+        for tick in ticks[1:]:
+            rig.step(GO, tick=tick)
+        rig.reply = rig.codec.stop * 3
+        assert rig.step(GO, superseded=True).link == "up"
+        assert rig.out.applied.linear <= 0.05
+
+
 # the pose and the settings
 
 
