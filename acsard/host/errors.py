@@ -31,19 +31,6 @@ class Exit(IntEnum):
     BAD_CONFIG = 78
 
 
-EXIT_TEXTS: dict[int, str] = {
-    Exit.OK: "done",
-    Exit.FAILURE: "failure",
-    Exit.USAGE: "wrong usage",
-    Exit.INCOMPLETE: "part of the recording was left out",
-    Exit.NO_PORT: "no such port",
-    Exit.UNREACHABLE: "daemon unreachable",
-    Exit.IN_USE: "port, bus address or robot id in use",
-    Exit.NO_PERMISSION: "no permission",
-    Exit.BAD_CONFIG: "bad configuration",
-}
-
-
 class MendableError(AcsardError):
     """An error whose cause a person can fix. Its text says how."""
 

@@ -86,11 +86,6 @@ def masters_of(path: str) -> Iterator[Holder]:
             yield holder
 
 
-def name_of(pid: int) -> str:
-    """Return the program name of a process; "" if it does not exist or is hidden from this user."""
-    return _name(PROC / str(pid))
-
-
 def is_daemon_here(pid: int) -> bool:
     """Return whether the daemon with the process id `pid` runs on this machine.
 

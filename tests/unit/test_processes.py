@@ -16,7 +16,7 @@ from acsard.host import processes
 from acsard.host.child import (
     acsard,
 )
-from acsard.host.processes import holder_of, holders, master_of, name_of
+from acsard.host.processes import holder_of, holders, master_of
 from tests.each import each
 
 HOLD = """\
@@ -110,5 +110,5 @@ def test_only_a_process_that_executes_acsard_has_its_name_and_a_daemon_runs_run(
     (tmp_path / "1").mkdir(exist_ok=True)
     (tmp_path / "1" / "cmdline").write_bytes(b"".join(word.encode() + b"\0" for word in command))
     (tmp_path / "1" / "comm").write_text("other\n")
-    assert name_of(1) == name.removesuffix(" run")
+    assert processes._name(tmp_path / "1") == name.removesuffix(" run")
     assert processes.is_daemon_here(1) is name.endswith(" run")
