@@ -38,6 +38,6 @@ def test_a_recording_replays_with_the_same_result(path: Path) -> None:
     for output, first in comparison.first_by_output.items():
         if output not in ("reason", "event text"):
             pytest.fail("\n".join(describe_difference(first, steps[0].now.mono_ns)))
-    assert comparison.lines == comparison.lines_same > 100
-    assert comparison.modes_same == comparison.steps
+    assert comparison.all["lines"] == comparison.equal["lines"] > 100
+    assert comparison.equal["modes"] == comparison.steps
     assert comparison.exact, "an estimate is another in its last bits"

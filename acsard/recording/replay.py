@@ -8,13 +8,14 @@ so for steps, and `Playback` for a recording, whose robot begins at a `Head`.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+import operator
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import lru_cache
-from itertools import zip_longest
 from typing import Literal
 
-from msgspec import Struct
+from msgspec import Struct, field
 
 from acsard.core.config.parsing import ConfigError, parse_recorded
 from acsard.core.config.settings import Config
@@ -64,16 +65,10 @@ class Comparison(Struct):
     """The result of a replay so far."""
 
     steps: int = 0
-    lines: int = 0  # steps in which the recorded robot, the replayed one, or both sent a line
-    lines_same: int = 0
-    poses: int = 0
-    poses_same: int = 0
-    modes_same: int = 0
-    reasons_same: int = 0
-    links_same: int = 0
-    sources_same: int = 0
-    events: int = 0  # the larger number of each step
-    events_same: int = 0
+    # Outputs of the recorded or the replayed robot by their kind, such as "poses", and the equal
+    # ones. Of two numbers in a step the larger one counts.
+    all: Counter[str] = field(default_factory=Counter)
+    equal: Counter[str] = field(default_factory=Counter)
     exact: bool = True  # all poses, twists and wheel angles are equal to the last bit
     first: Difference | None = None  # with any difference
     first_by_output: dict[Output, Difference] = {}
@@ -169,20 +164,9 @@ class Replay:
     def _count(self, step: RecordedStep, has_poses: bool, replayed: RecordedOutputs) -> None:
         comparison, recorded = self.comparison, step.recorded
         comparison.steps += 1
-        if recorded.line is not None or replayed.line is not None:
-            comparison.lines += 1
-            comparison.lines_same += recorded.line == replayed.line
-        now, before = replayed.status, recorded.status
-        comparison.modes_same += now.mode == before.mode
-        comparison.reasons_same += now.reason == before.reason
-        comparison.links_same += now.link == before.link
-        comparison.sources_same += now.source == before.source
-        for new, old in zip_longest(replayed.events, recorded.events):
-            comparison.events += 1
-            comparison.events_same += new == old
-        comparison.poses += len(recorded.poses)
-        pairs = zip(recorded.poses, replayed.poses, strict=False)
-        comparison.poses_same += sum(a == b for a, b in pairs)
+        for (kind, new), (_, old) in zip(_outputs(replayed), _outputs(recorded), strict=True):
+            comparison.all[kind] += max(len(new), len(old))
+            comparison.equal[kind] += sum(map(operator.eq, new, old))
         recorded_speed, replayed_speed = comparison.max_wheel_speeds
         comparison.max_wheel_speeds = (
             max(recorded_speed, max_wheel_speed(recorded.line)),
@@ -196,6 +180,17 @@ class Replay:
             if pose != self._pose:
                 apart = math.hypot(pose[0] - self._pose[0], pose[1] - self._pose[1]) / US_PER_S
                 comparison.max_distance_m = max(comparison.max_distance_m, apart)
+
+
+def _outputs(outputs: RecordedOutputs) -> Iterator[tuple[str, Sequence[object]]]:
+    status = outputs.status
+    yield "lines", () if outputs.line is None else (outputs.line,)
+    yield "poses", outputs.poses
+    yield "modes", (status.mode,)
+    yield "reasons", (status.reason,)
+    yield "links", (status.link,)
+    yield "sources", (status.source,)
+    yield "events", outputs.events
 
 
 def _different_parts(

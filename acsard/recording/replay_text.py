@@ -24,22 +24,13 @@ MAX_KEYS = 8  # changed settings in a line of text
 def verdict(comparison: Comparison) -> str:
     """Return a line of text: how many outputs of each kind are equal."""
     c = comparison
-    shares = (
-        ("poses", c.poses_same, c.poses),
-        ("modes", c.modes_same, c.steps),
-        ("reasons", c.reasons_same, c.steps),
-        ("links", c.links_same, c.steps),
-        ("sources", c.sources_same, c.steps),
-        ("events", c.events_same, c.events),
-    )
-    rest = ", ".join(f"{_share(same, total)} {name}" for name, same, total in shares)
+    first, *rest = [
+        f"{c.equal[kind]:,} of {total:,}".replace(",", " ") + f" {kind}"
+        for kind, total in c.all.items()
+    ]
     rounded = c.same and not c.exact
     bits = " (poses agree to 1 um, but not to the last bit)" if rounded else ""
-    return f"{_share(c.lines_same, c.lines)} lines are the same, {rest}{bits}"
-
-
-def _share(same: int, total: int) -> str:
-    return f"{same:,} of {total:,}".replace(",", " ")
+    return f"{first} are the same, {', '.join(rest)}{bits}"
 
 
 def explain_verdict(other: bool) -> str:
@@ -153,10 +144,11 @@ def _speeds(recorded: int, replayed: int) -> str:
 
 def describe_outcome(comparison: Comparison) -> list[str]:
     """Return lines that compare the motion: lines to the board, wheel speeds, poses, distance."""
+    total, equal = comparison.all, comparison.equal
     rows = [
-        f"{comparison.lines - comparison.lines_same} of {comparison.lines} lines to the board "
-        f"differ from the recorded ones, and {comparison.steps - comparison.modes_same} of "
-        f"{comparison.steps} steps have a different mode",
+        f"{total['lines'] - equal['lines']} of {total['lines']} lines to the board "
+        f"differ from the recorded ones, and {total['modes'] - equal['modes']} of "
+        f"{total['modes']} steps have a different mode",
         "the highest wheel speed in any line to the board: "
         f"{_speeds(*comparison.max_wheel_speeds)}",
     ]

@@ -47,12 +47,12 @@ def lives_again(tape: Tape, config: Config, first: int = 0, least: int = 100) ->
     comparison = replayed(tape, config, first).comparison
     assert comparison.first is None
     assert comparison.exact
-    assert comparison.steps == comparison.modes_same == len(tape.taken) - first
+    assert comparison.steps == comparison.equal["modes"] == len(tape.taken) - first
     steps = tape.taken[first:]
     lines = sum(step.line is not None for step in steps)
-    assert comparison.lines == comparison.lines_same == lines >= least
+    assert comparison.all["lines"] == comparison.equal["lines"] == lines >= least
     poses = sum(len(step.news.estimates) for step in steps)
-    assert comparison.poses == comparison.poses_same == poses >= least
+    assert comparison.all["poses"] == comparison.equal["poses"] == poses >= least
     assert comparison.end is not None
     assert comparison.end[0] == comparison.end[1]
     assert comparison.max_distance_m == 0.0
