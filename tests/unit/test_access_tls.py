@@ -16,7 +16,7 @@ from acsard.bus import tls_trouble
 from acsard.bus.tls_files import AUTHORITY, common_name, expiry_times, require_usable
 from acsard.bus.tls_trouble import trouble
 from acsard.core.values import NS_PER_S
-from acsard.host.errors import CertificateError, NotPermittedError
+from acsard.host.errors import CertificateError
 from acsard.machine.authority import Authority
 
 DAY_NS = 86400 * NS_PER_S
@@ -69,13 +69,6 @@ def test_unusable_files_are_a_bad_configuration(tmp_path: Path, how: str) -> Non
         require_usable(str(tmp_path))
     assert str(tmp_path) in str(caught.value)
     assert "acsard tls" in str(caught.value)
-
-
-@pytest.mark.skipif(os.geteuid() == 0, reason="root reads everything")
-def test_a_key_that_this_user_may_not_read_is_a_missing_permission(tmp_path: Path) -> None:
-    (make_certificates(tmp_path) / "key.pem").chmod(0)
-    with pytest.raises(NotPermittedError):
-        require_usable(str(tmp_path))
 
 
 def test_the_ends_of_the_certificate_and_of_its_authority_are_read(tmp_path: Path) -> None:

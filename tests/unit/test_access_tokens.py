@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import errno
 import json
-import os
 import stat
 import time
 from pathlib import Path
 
 import pytest
 
+from acsard.cli import main
 from acsard.host import clock
-from acsard.host.errors import MendableError, NotPermittedError, UsageError
+from acsard.host.errors import MendableError, UsageError
+from acsard.machine.authority import Authority
 from acsard.web import tokens
 from acsard.web.callers import AdmittedClient
 from acsard.web.tokens import ReadTokens, Vault
@@ -167,13 +168,6 @@ def test_a_name_is_given_once_and_an_unknown_one_cannot_be_revoked(tmp_path: Pat
         vault.revoke("phone")
 
 
-@pytest.mark.skipif(os.geteuid() == 0, reason="root may write everywhere")
-def test_a_directory_without_write_permission_is_reported(tmp_path: Path) -> None:
-    tmp_path.chmod(0o500)
-    with pytest.raises(NotPermittedError, match="sudo"):
-        Vault(tmp_path / "state", "robot1").invite("viewer", "tv", 1)
-
-
 def test_robots_that_share_the_file_know_their_own_tokens_alone(tmp_path: Path) -> None:
     first, second = Vault(tmp_path, "robot1"), Vault(tmp_path, "robot2")
     ours, _ = first.invite("operator", "phone", 1)
@@ -188,3 +182,18 @@ def test_robots_that_share_the_file_know_their_own_tokens_alone(tmp_path: Path) 
     assert (first.all(), [entry.name for entry in second.all()]) == ([], ["phone"])
     with pytest.raises(UsageError, match="the robot's tokens: none"):
         first.revoke("phone")
+
+
+def test_the_link_of_an_invitation_and_the_list_say_how_long_it_lasts(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("STATE_DIRECTORY", str(tmp_path / "state"))
+    Authority.make(Path("tls"), "test", 1).issue(Path("tls"), "robot", ["localhost"], 1)
+    for words, lasts in ((("viewer", "--hours", "1"), "1 h"), (("operator",), "30 d")):
+        web = ["web", "--tls", "tls", "--address", "https://127.0.0.1:8443", "invite"]
+        assert main([*web, *words]) == 0
+        assert f", for {lasts}; the link" in capsys.readouterr().out
+    assert main(["web", "tokens"]) == 0
+    rows = capsys.readouterr().out.splitlines()
+    assert [row.rpartition(", ")[2] for row in rows] == ["1 h left", "30 d left"]
