@@ -8,13 +8,15 @@ import pwd
 import stat
 from collections.abc import Sequence
 
-from acsard.host.processes import Holder, is_pty, is_running, masters_of
+from acsard.host.processes import Holder, is_pty, masters_of
 
 GETTY = "agetty"  # the login console of Debian and Raspberry Pi OS
 
 GROUP_RIGHTS = stat.S_IRGRP | stat.S_IWGRP
 
 TTY_GROUP = 5  # of each Debian system; a login console gives the port to it
+
+UNSEEN_GROUP = 65534  # any group outside of the service's user namespace (PrivateUsers=)
 
 
 def console_advice(path: str) -> str:
@@ -31,10 +33,15 @@ def console_advice(path: str) -> str:
 def denial(path: str) -> tuple[str, str]:
     """Return why this user may not open the device, and what to do."""
     status = os.stat(path)
+    if status.st_gid == UNSEEN_GROUP:
+        return f"{path} is not open to the group dialout, to which the service belongs", (
+            "`sudo acsard doctor` names a login console that uses it; if there is none, let its "
+            'udev rule set GROUP="dialout" and MODE="0660", as deploy/udev/70-acsar.rules does'
+        )
     group, mode = _group(status.st_gid), stat.S_IMODE(status.st_mode)
     if mode & GROUP_RIGHTS != GROUP_RIGHTS:
         text = f"{path} has the mode {mode:03o}, so no group may open it"
-        if status.st_gid == TTY_GROUP and is_running(GETTY):
+        if status.st_gid == TTY_GROUP and not is_pty(path):
             return f"{text}: a login console ({GETTY}) probably uses it", console_advice(path)
         return text, f"run `sudo chmod g+rw {path}`, or correct the udev rule of this device"
     text = f"{path} belongs to group {group}"

@@ -230,16 +230,31 @@ DEVICES = {
 """Numbers of devices without hardware. If one may be opened, opening it blocks or fails later."""
 
 
+def codes(container: Container, numbers: tuple[int, int], group: str, mode: str) -> str:
+    """Return the exit code of the service on a port that is this device."""
+    container.run("mknod", PORT, "c", *map(str, numbers))
+    try:
+        container.run("chgrp", group, PORT)
+        container.run("chmod", mode, PORT)
+        container.start()
+        return container.show("ExecMainStatus")
+    finally:
+        container.path(PORT).unlink()
+        container.reset()
+
+
 def test_serial_ports_may_be_opened_and_no_other_device(container: Container) -> None:
-    codes = {}
-    for kind, numbers in DEVICES.items():
-        container.run("mknod", PORT, "c", *map(str, numbers))
-        try:
-            container.run("chgrp", "dialout", PORT)
-            container.run("chmod", "0660", PORT)
-            container.start()
-            codes[kind] = container.show("ExecMainStatus")
-        finally:
-            container.path(PORT).unlink()
-            container.reset()
-    assert codes == dict.fromkeys(DEVICES, "0") | {"fuse": "77"}
+    ended = {
+        kind: codes(container, numbers, "dialout", "0660") for kind, numbers in DEVICES.items()
+    }
+    assert ended == dict.fromkeys(DEVICES, "0") | {"fuse": "77"}
+
+
+def test_a_port_that_the_service_may_not_open_is_named_with_two_remedies(
+    container: Container,
+) -> None:
+    """A login console gives the port this group and mode. The unit sees neither of them."""
+    assert codes(container, DEVICES["ttyS"], "tty", "0620") == "77"
+    said = container.messages()
+    assert f"{PORT} is not open to the group dialout" in said
+    assert "`sudo acsard doctor` names a login console" in said
