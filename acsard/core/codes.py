@@ -135,7 +135,7 @@ stalled
 neutral
     send a zero first: {source} must send a zero{alone}{pause} before it can drive{lasts}{ros}
 zeros
-    {source} commands zero speed: it has sent only zeros for over {lasts}{note}
+    {source} commands zero speed: it has sent only zeros for over 3 s{note}
 higher
     {source} has priority:
     -> wait until it is silent

@@ -275,9 +275,7 @@ class Wait(Struct, frozen=True):
     source: str = ""
     seconds: float = 0.0
     senders: int = 0  # that wait while another one of the same source drives
-    # Duration: for neutral, s of speeds without a zero; for zeros, s of only zeros: rounded down to
-    # a few values, so that the text seldom changes.
-    lasts: float = 0.0
+    lasts: bool = False  # for neutral: for a while it has sent speeds without a zero
     # Source, or "another sender of NAME", whose speeds have no effect against zeros of `source`.
     # Of an `AgeCode`: a figure in words.
     kept: str = ""

@@ -22,8 +22,7 @@ from acsard.core.values import NS_PER_S, REST, Command, Ns, SourceStatus, Twist,
 
 MAX_SENDERS = 16  # of a source; one that may drive is never replaced
 
-# s of zeros only, or of speeds without being armed, to which `state` rounds down.
-REPORTED_DURATIONS_S = (3.0, 10.0, 60.0, 600.0, 3600.0)
+LASTING_NS = 3 * NS_PER_S  # of zeros only, or of speeds without being armed, until `state` says so
 
 NOTHING, COMMAND = Wait("nothing"), Wait("command")
 
@@ -215,9 +214,9 @@ class Arbiter(Struct):
         if not (armed and sender.is_live(now_ns, timeout_ns(settings))):
             return Choice(settings.name, None, _wait(sender, settings, now_ns, True), None, name)
         wait, since_ns = NOTHING, sender.zeros_ns
-        if since_ns is not None and (lasts := _reported_duration_s(now_ns - since_ns)):
+        if since_ns is not None and now_ns - since_ns >= LASTING_NS:
             kept = self._without_effect(now_ns, commands)
-            wait = Wait("zeros", settings.name, lasts=lasts, kept=kept)
+            wait = Wait("zeros", settings.name, kept=kept)
         return Choice(settings.name, sender.twist, wait, sender.arrived_ns, name)
 
     def _refused(self, settings: Source, now_ns: Ns) -> Wait | None:
@@ -322,7 +321,7 @@ def _wait(sender: Sender, settings: Source, now_ns: Ns, lasting: bool) -> Wait:
         "neutral",
         settings.name,
         NEUTRAL_PAUSE_NS / NS_PER_S,
-        lasts=0.0 if since_ns is None else _reported_duration_s(now_ns - since_ns),
+        lasts=since_ns is not None and now_ns - since_ns >= LASTING_NS,
         ros=sender.ros,
         shared=sender.shared,
         pause=settings.neutral_first == "pause",
@@ -332,19 +331,6 @@ def _wait(sender: Sender, settings: Source, now_ns: Ns, lasting: bool) -> Wait:
 def _changes_ns(sender: Sender, now_ns: Ns, timeout: Ns) -> Ns:
     until_ns = sender.changes_ns(now_ns, timeout)
     for since_ns in (sender.zeros_ns, sender.speeds_ns):
-        if since_ns is not None:
-            until_ns = min(until_ns, since_ns + _next_report_ns(now_ns - since_ns))
+        if since_ns is not None and now_ns < since_ns + LASTING_NS:
+            until_ns = min(until_ns, since_ns + LASTING_NS)
     return until_ns
-
-
-def _next_report_ns(ns: Ns) -> Ns:
-    # The duration at which `_reported_duration_s` gives another result.
-    for seconds in REPORTED_DURATIONS_S:
-        if ns < seconds * NS_PER_S:
-            return int(seconds * NS_PER_S)
-    return FOREVER_NS
-
-
-def _reported_duration_s(ns: Ns) -> float:
-    reached = [seconds for seconds in REPORTED_DURATIONS_S if ns >= seconds * NS_PER_S]
-    return reached[-1] if reached else 0.0

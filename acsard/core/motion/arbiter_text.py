@@ -7,7 +7,7 @@ from functools import lru_cache
 from msgspec import Struct
 
 from acsard.core.codes import Reason, sentence
-from acsard.core.formatting import lasting, many
+from acsard.core.formatting import many
 from acsard.core.motion.arbiter import Choice
 from acsard.core.motion.modes import Mode
 from acsard.core.values import NS_PER_S, Event, Ns, Refusal, Wait
@@ -54,12 +54,12 @@ def waiting(wait: Wait) -> Reason:
                 source=wait.source,
                 alone=f", and then no speed for {wait.seconds:g} s," if wait.shared else "",
                 pause=f", or nothing for {wait.seconds:g} s," if wait.pause else "",
-                lasts=f"; it has sent speeds for over {lasting(wait.lasts)}" if wait.lasts else "",
+                lasts="; it has sent speeds for over 3 s" if wait.lasts else "",
                 ros=ROS_NEVER if wait.ros else "",
             )
         case "zeros":
             note = f"; the speeds of {wait.kept} have no effect" if wait.kept else ""
-            return sentence("zeros", source=wait.source, lasts=lasting(wait.lasts), note=note)
+            return sentence("zeros", source=wait.source, note=note)
         case "senders":
             return sentence("senders", others=many(wait.senders, "other sender"))
         case _:
@@ -116,8 +116,10 @@ class CommandEvents(Struct):
         wait, source = choice.wait, ""
         if mode not in (Mode.READY, Mode.DRIVING) or wait.what not in ("neutral", "zeros"):
             self.kept = ""
+        elif wait.what == "zeros":
+            source = wait.kept
         elif wait.lasts:
-            source = wait.source if wait.what == "neutral" else wait.kept
+            source = wait.source
         if not source or source == self.kept:
             return []
         self.kept = source
