@@ -11,7 +11,7 @@ import argparse
 import itertools
 import sys
 import time
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Collection, Iterator
 from itertools import pairwise
 from statistics import fmean, pstdev, quantiles
@@ -84,9 +84,9 @@ def main(args: argparse.Namespace) -> int:
         with connected(args) as robot:
             return _print_rates(robot, topic, args.n)
     with connected_to_many(args) as (robot, many):
-        silence, quota = Silence(robot, topic), Quota(args.n, {""})
+        silence, robots = Silence(robot, topic), None
         if many:
-            silence, quota = Silence(robot, ""), Quota(args.n, _expected(robot, many))
+            silence, robots = Silence(robot, ""), _expected(robot, many)
             subscription = follow(robot.session, many, topic)
             samples = subscription.until_silence(args.timeout, silence.look)
         else:
@@ -94,51 +94,30 @@ def main(args: argparse.Namespace) -> int:
             if robot.where.tls and (why := robot.whoami().silence):
                 print(f"acsard: {why}. Waiting.", file=sys.stderr)
                 silence.heard()  # the reason for the silence has just been printed
-        return _print(samples, short_form, quota, bool(many), args.timeout, silence)
-
-
-class Quota:
-    """Counts the printed messages of each robot, and limits their number."""
-
-    def __init__(self, most: int | None, robots: Collection[str]) -> None:
-        # `used_up` is true when each of these robots, or each that has printed, has `most`.
-        self._most, self._robots, self._counts = most, robots, dict[str, int]()
-
-    def take(self, robot: str) -> bool:
-        """Return whether one more message of this robot may be printed, and count it."""
-        count = self._counts.get(robot, 0)
-        if count == self._most:
-            return False
-        self._counts[robot] = count + 1
-        return True
-
-    @property
-    def used_up(self) -> bool:
-        if self._most is None:
-            return False
-        return all(self._counts.get(robot) == self._most for robot in self._robots or self._counts)
+        return _print(samples, short_form, args.n, robots, args.timeout, silence)
 
 
 def _print(
     samples: Iterator[zenoh.Sample],
     decoder: Decoder[Any] | None,
-    quota: Quota,
-    of_many: bool,
+    most: int | None,
+    robots: Collection[str] | None,
     timeout: float | None,
     silence: Silence,
 ) -> int:
-    # Until Ctrl-C, the `quota`, or a silence.
-    printed_s = time.monotonic()
+    # Until Ctrl-C, `most` messages of each robot, or a silence. `robots` is None for one robot.
+    counts, printed_s = Counter[str](), time.monotonic()
     try:
         for sample in samples:
             silence.heard()
-            whose = robot_of(str(sample.key_expr)) if of_many else ""
-            if quota.take(whose):
+            whose = "" if robots is None else robot_of(str(sample.key_expr))
+            if counts[whose] != most:
+                counts[whose] += 1
                 print(_message_text(decoder, *encoded(sample), whose), flush=True)
                 printed_s = time.monotonic()
             elif timeout is not None and time.monotonic() - printed_s > timeout:
                 return Exit.FAILURE
-            if quota.used_up:
+            if all(counts[robot] == most for robot in robots or counts):
                 return Exit.OK
     except KeyboardInterrupt:
         return Exit.OK

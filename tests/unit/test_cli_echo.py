@@ -10,7 +10,7 @@ import msgspec
 import pytest
 
 from acsard.cli import echo, main
-from acsard.cli.echo import Quota, _message_text, _print, rate_text
+from acsard.cli.echo import _message_text, _print, rate_text
 from acsard.cli.replies import json_line
 from acsard.core.messages.encodings import Decoder, Format, encode, encoding_name
 from acsard.core.messages.schema import (
@@ -72,7 +72,7 @@ def printed(robots: str, senders: str, most: int | None, timeout: float | None =
         for sender in senders
     ]
     silence: Any = SimpleNamespace(heard=lambda: None, explain=lambda: None)
-    return _print(iter(samples), None, Quota(most, robots), True, timeout, silence)
+    return _print(iter(samples), None, most, robots, timeout, silence)
 
 
 @pytest.mark.parametrize(
