@@ -38,10 +38,10 @@ def address_of(
     # The daemon listens only in peer mode. A tcp endpoint comes first, because it needs no
     # certificate.
     endpoints = sorted(bus.listening or bus.connect, key=is_tls)
-    endpoint = connect or reachable(endpoints[0])
-    certificates = (tls or bus.tls) if is_tls(endpoint) else ""
+    endpoint = reachable(endpoints[0]) if connect is None else connect
+    certificates = (bus.tls if tls is None else tls) if is_tls(endpoint) else ""
     advice = ""
-    if not connect and bus.mode == "peer" and bus.connect:
+    if connect is None and bus.mode == "peer" and bus.connect:
         advice = (
             'if this computer has no daemon, write bus.mode = "client" into its configuration '
             "file: then the tools connect to bus.connect"
@@ -55,27 +55,12 @@ def address_by_environment(endpoint: str | None, robot_id: str | None, tls: str 
     An argument that is None comes from the file that $ACSARD_CONFIG names, or is the default.
     $ACSARD_TLS wins over the file. Raises `UsageError` for a malformed id or an unusable file.
     """
-    complete = endpoint is not None and robot_id is not None
-    if complete and (tls is not None or not is_tls(endpoint or "")):
-        # The arguments give every value, so do not read the file, which need not exist.
-        config = Config()
-    else:
-        config = _config_of_environment()
-    where = address_of(config, endpoint, robot_id, tls)
-    return Address(
-        where.endpoint if endpoint is None else endpoint,
-        where.robot_id,
-        where.tls if tls is None else tls,
-        where.advice,
-    )
-
-
-def _config_of_environment() -> Config:
     file = os.environ.get("ACSARD_CONFIG")
-    tls = os.environ.get("ACSARD_TLS")
-    overrides: dict[str, dict[str, object]] = {} if tls is None else {"bus": {"tls": tls}}
+    overrides: dict[str, dict[str, object]] = {}
+    if "ACSARD_TLS" in os.environ:
+        overrides["bus"] = {"tls": os.environ["ACSARD_TLS"]}
     try:
-        return parse(read(Path(file)) if file else b"", overrides)
+        config = parse(read(Path(file)) if file else b"", overrides)
     except OSError as error:
         raise UsageError(
             f"cannot read {file}, which ACSARD_CONFIG names: {error.strerror}; set ACSARD_CONFIG "
@@ -84,6 +69,7 @@ def _config_of_environment() -> Config:
     except ConfigError as error:
         where = f"{file}, which ACSARD_CONFIG names" if file else "the environment"
         raise UsageError(f"{where}: {'; '.join(error.problems)}") from None
+    return address_of(config, endpoint, robot_id, tls)
 
 
 def require_id(robot_id: str) -> None:

@@ -76,8 +76,6 @@ def test_an_unusable_file_is_named(named: Path, text: str | None, words: str) ->
         address_by_environment(None, "r8", "")
     assert words in str(error.value)
     assert str(named) in str(error.value)
-    # A program that gives endpoint, robot id and certificate itself needs no file.
-    assert address_by_environment(NOBODY, "r8", "")[:3] == (NOBODY, "r8", "")
 
 
 def test_a_client_without_a_session_names_its_router_and_no_address_to_listen_on() -> None:
