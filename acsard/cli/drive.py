@@ -4,15 +4,17 @@ from __future__ import annotations
 
 import argparse
 import sys
+from contextlib import suppress
 
 from acsard.cli.common import add_speeds
 from acsard.cli.robot_options import add_bus, connected, require_one
+from acsard.client.connection import Connection
 from acsard.core.messages.permissions import COMMAND_ROLE, has
-from acsard.host.errors import NoAnswerError, NotPermittedError, UsageError
+from acsard.host.errors import MendableError, NoAnswerError, NotPermittedError, UsageError
 from acsard.host.logs import MAX_LAST_OUTPUT_S, output_in_threads
 from acsard.terminal.output import has_screen
 from acsard.top import terminal
-from acsard.top.drive_screen import HELP
+from acsard.top.drive_screen import HELP, velocity
 from acsard.top.keyboard import Keyboard, KeyboardDrive
 
 
@@ -38,10 +40,18 @@ def main(args: argparse.Namespace) -> int:
     with output_in_threads(MAX_LAST_OUTPUT_S), connected(args, args.source) as robot:
         if robot.where.tls and not has((us := robot.whoami()).role, COMMAND_ROLE):
             raise (NotPermittedError if us.role else NoAnswerError)(us.describe())
-        ride = KeyboardDrive(robot, Keyboard(args.linear, args.angular))
+        ride = KeyboardDrive(robot, Keyboard(args.linear, args.angular), _limits(robot))
         try:
             terminal.drive(ride)
         finally:
             ride.end()
         terminal.print_last_report(ride)
     return 0
+
+
+def _limits(robot: Connection) -> str:
+    # Over TLS only a maintainer may read them.
+    with suppress(MendableError):
+        limits = robot.get("config")["limits"]
+        return velocity(limits["linear_speed"], limits["angular_speed"])
+    return ""

@@ -5,9 +5,9 @@ and y in m and the heading. VERSION marks a number as older if another robot in 
 higher one. SEEN gives the age of the last report. WHY gives the warnings, then the
 reason why the robot moves or does not move, then the details of the warnings. A robot that is ready
 can have warnings too: a certificate that expires soon, a recording or a latch file that fails, a
-wheel fault, settings that differ from the configuration file. A robot that --id or `[fleet] robots`
-names is always listed, and the exit code is 69 if it is gone or does not answer. On a narrow
-terminal some columns are left out and long lines are cut; `acsard fleet | cat` prints everything.
+wheel fault. A robot that --id or `[fleet] robots` names is always listed, and the exit code is 69
+if it is gone or does not answer. On a narrow terminal some columns are left out and long lines are
+cut; `acsard fleet | cat` prints everything.
 """
 
 from __future__ import annotations

@@ -34,6 +34,7 @@ class Teleop(Struct, frozen=True):
     age: float  # since `state` arrived, or since the wait for the first one began
     objection: str = ""  # why the robot does not follow the keys, or ""
     silent: bool = False  # no state has arrived for too long
+    limits: str = ""  # of the robot at the start of this drive, or "" if unknown
 
 
 def screen(teleop: Teleop) -> Group:
@@ -49,8 +50,14 @@ def screen(teleop: Teleop) -> Group:
                 words += f": {printable(teleop.objection)}"
             parts.append(Text(words, "bold red"))
         parts.append(_measured(teleop.state))
-    parts.append(Text(f"keys ask for {teleop.linear:.2f} m/s, {teleop.angular:.2f} rad/s"))
+    parts.append(Text(f"keys ask for {velocity(teleop.linear, teleop.angular)}"))
+    if teleop.limits:
+        parts.append(Text(f"the robot allowed {teleop.limits} when this drive began"))
     return Group(*parts, Text(), Text("\n".join(HELP), "dim"))
+
+
+def velocity(linear: float, angular: float) -> str:
+    return f"{linear:.2f} m/s, {angular:.2f} rad/s"
 
 
 def last_report(teleop: Teleop) -> Group:

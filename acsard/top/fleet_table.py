@@ -88,7 +88,7 @@ def _why(state: RobotState) -> str:
     if problems:
         parts.insert(1 if state.mode in URGENT else 0, brief(problems))
     details = [(warning.what.replace("_", " "), warning.text) for warning in problems]
-    details.append(("speed limit", state.speed_limit))
+    details += [("speed limit", state.speed_limit), ("set", state.settings_differ)]
     return "; ".join(parts + [f"{what}: {printable(text)}" for what, text in details if text])
 
 

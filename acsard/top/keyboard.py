@@ -103,8 +103,8 @@ class Keyboard:
 class KeyboardDrive:
     """Sends the commands of the typed keys to the robot, and receives the robot's state."""
 
-    def __init__(self, robot: Connection, keyboard: Keyboard) -> None:
-        self._robot, self._keyboard = robot, keyboard
+    def __init__(self, robot: Connection, keyboard: Keyboard, limits: str = "") -> None:
+        self._robot, self._keyboard, self._limits = robot, keyboard, limits
         self._driver = Driver(robot)
         # Subscribing may take long. The terminal discards the keys that are typed until it is done.
         self._fine = self._stepped = clock.steady_s()
@@ -154,6 +154,7 @@ class KeyboardDrive:
             watch.age(now),
             why,
             watch.silent(now),
+            self._limits,
         )
 
 

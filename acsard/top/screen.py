@@ -230,6 +230,8 @@ def _facts(data: ScreenData, state: RobotState) -> Table:
         rows.append(("board", inputs))
     if state.certificate_expiry:
         rows.append(("certificate", clean(state.certificate_expiry)))
+    if state.settings_differ:
+        rows.append(("set", f"{clean(state.settings_differ)} as at the daemon's start"))
     rows += [
         ("rejected", _rejected(state, data.before or state)),
         ("last one", clean(state.refused) or "-"),

@@ -29,7 +29,7 @@ from acsard.core.messages.short_texts import short
 from acsard.core.motion.modes import Mode
 from acsard.daemon.latencies import NAMES
 from acsard.top import drive_screen, screen
-from acsard.top.drive_screen import Teleop
+from acsard.top.drive_screen import Teleop, velocity
 from acsard.top.fleet_table import table
 from acsard.top.roster import Row
 from acsard.top.screen import MODE_STYLES, ScreenData, rate
@@ -68,14 +68,19 @@ TOP = {
     "a robot with warnings": replace(SEEN, state=WARNED),
     "a stopped robot": of(mode="stopped", code="stopped", reason="stopped by ann; call srv/clear"),
     "a simulator without a link": replace(
-        of(link="down"), info=replace(INFO, simulated=True), before=None, passed=0.0
+        of(link="down", settings_differ="limits.linear_speed = 0.2, not 1.0"),
+        info=replace(INFO, simulated=True),
+        before=None,
+        passed=0.0,
     ),
     "many sources": of(sources=MANY),
     "after a clear": of(sources=[replace(source, age=None) for source in STATE.sources]),
     "without measurements": of(latencies=dict.fromkeys(STATE.latencies, UNMEASURED)),
 }
 
-TELEOP = Teleop("acsar", "tcp/127.0.0.1:7448", "teleop", 0.5, 1.0, WAITING, 0.1)
+TELEOP = Teleop(
+    "acsar", "tcp/127.0.0.1:7448", "teleop", 0.5, 1.0, WAITING, 0.1, limits=velocity(0.2, 0.5)
+)
 OBJECTED = replace(TELEOP, objection="app has the same priority and came first")
 STILL = replace(STATE, linear=0.0, angular=0.0, wheels=[0.0] * 4)
 LONG = (

@@ -385,13 +385,8 @@ def _latch_file(trouble: str | None) -> list[Row]:
 
 
 def _settings(differ: str) -> Row:
-    if not differ:
-        return Row("settings", OK, "those of the start", {})
-    advice = (
-        "the next start of the daemon uses the values of the file; `acsard set KEY VALUE --keep` "
-        "on the robot writes a value into the file"
-    )
-    return Row("settings", WARN, f"changed since the daemon's start: {differ}", {}, advice)
+    changed = f"changed since the daemon's start: {differ}" if differ else "those of the start"
+    return Row("settings", OK, changed, {})
 
 
 def _counted(counters: dict[str, int], kind: str) -> dict[str, str]:

@@ -17,7 +17,7 @@ from acsard.core.messages.schema import BatterySummary, RobotState
 
 What = Literal[
     "emergency_stop", "bumper", "battery", "certificate", "recording", "latch_file", "wheel",
-    "pose", "settings",
+    "pose",
 ]  # fmt: skip
 
 WARNING_KINDS: tuple[What, ...] = get_args(What)  # most urgent first
@@ -96,5 +96,3 @@ def _warnings(state: RobotState) -> Iterator[StateWarning]:
         yield StateWarning("wheel", "wheel fault", state.wheel_fault)
     if doubt := CODES.get(state.pose_doubt):
         yield StateWarning("pose", "pose doubtful", f"{doubt.text} {doubt.advice}")
-    if state.settings_differ:
-        yield StateWarning("settings", "settings differ", state.settings_differ)
