@@ -9,9 +9,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from acsard.core.config.settings import FeedbackConfig, McuConfig
+from acsard.core.link.board_counts import Encoders, Turned, Unknown
 from acsard.core.link.checked_line import Checked, Reading, seal, unseal
 from acsard.core.link.codec import FrameError
-from acsard.core.link.encoders import Encoders, Turned, Unknown
 from acsard.core.link.lines import MAX_LINE_BYTES
 from acsard.core.link.link_setup import LinkSetup
 from acsard.core.link.link_state import BAD_LINES

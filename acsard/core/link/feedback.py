@@ -10,10 +10,9 @@ from __future__ import annotations
 from msgspec import Struct, field
 
 from acsard.core.config.wire_time import wire_ns
+from acsard.core.link.board_counts import CountsCheck, Encoders, Turned
 from acsard.core.link.checked_line import Reading
 from acsard.core.link.codec import Motors
-from acsard.core.link.counts_check import CountsCheck
-from acsard.core.link.encoders import Encoders, Turned
 from acsard.core.link.line_times import FreeRunning, Prompted
 from acsard.core.link.link_setup import LinkSetup
 from acsard.core.link.link_state import WATCHDOG_NS

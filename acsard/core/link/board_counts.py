@@ -1,9 +1,13 @@
-"""Converts encoder counts into the angle that each motor turned since the previous reading.
+"""Converts the board's encoder counts into angles, and compares these with the speeds of the lines.
 
 The counts are cumulative, so a lost line costs no distance, and the time comes from the board's
 clock, so it does not depend on when the host read the lines. Both are modulo 65536. A difference is
 used only if the counts cannot have wrapped and a wheel at its highest speed can make it. Otherwise
 the caller uses speed times time. The module also detects a probable restart of the board.
+
+The firmware computes counts and speeds from the same edges, so they differ only if
+`mcu.encoder_counts` is wrong. Then the pose uses the speeds, and the difference until then is a
+doubt.
 """
 
 from __future__ import annotations
@@ -27,6 +31,19 @@ ROUNDING_MS = 2  # each of the two times is in whole ms
 
 # Excess over the least delay, which then rises; the session restarts after a gap of 1 s.
 MAX_DELAY_MS = 1000.0
+
+# Driving in the windows of `CountsCheck`, s; the first is short, so that wrong counts move the pose
+# little.
+WINDOW_S, FIRST_S = 1.0, 0.1
+
+MAX_DIFFERENCE = 0.2  # relative
+
+MIN_COUNTS = 40  # of all wheels in a window: fewer are wrong by their edges
+
+NONE: Motors = (0.0, 0.0, 0.0, 0.0)
+
+# Windows in a row that differ. In one, firmware that filters its speeds may have sped up.
+WRONG_WINDOWS = 2
 
 # No previous reading, or maybe a wrapped count; more than a motor can have turned; a restart.
 Unknown = Literal["unknown", "leap", "restarted"]
@@ -74,6 +91,48 @@ class Encoders(Struct):
             return "leap"
         angle = setup.count
         return Turned((a * angle, b * angle, c * angle, d * angle), mcu_ms / 1000)
+
+
+class CountsCheck(Struct):
+    agrees: bool = True  # in the last window
+    compared: bool = False
+    differing: int = 0  # windows in a row
+    # In this window: s of driving, and rad of all wheels by the counts and by the speeds.
+    seconds: float = 0.0
+    counted: float = 0.0
+    reported: float = 0.0
+    off: Motors = NONE  # by the counts minus by the speeds, rad
+    doubt: Motors | None = None  # `off` of a window that ends with the last line and differs
+
+    def add(self, turned: Motors, speeds: Motors, dt: float, count: float) -> None:
+        """Add a line: the angles by its counts, its speeds, and the time by the board's clock."""
+        a, b, c, d = turned
+        e, f, g, h = speeds
+        counted = abs(a) + abs(b) + abs(c) + abs(d)
+        reported = (abs(e) + abs(f) + abs(g) + abs(h)) * dt
+        if not counted and not reported:
+            return
+        self.seconds += dt
+        self.counted += counted
+        self.reported += reported
+        off_a, off_b, off_c, off_d = self.off
+        self.off = (
+            off_a + a - e * dt, off_b + b - f * dt, off_c + c - g * dt, off_d + d - h * dt,
+        )  # fmt: skip
+        window_s = WINDOW_S if self.compared else FIRST_S
+        if self.seconds >= window_s and max(self.counted, self.reported) >= MIN_COUNTS * count:
+            off = abs(self.counted - self.reported)
+            self.compared, used = True, self.agrees
+            self.agrees = off <= MAX_DIFFERENCE * self.reported
+            if used and not self.agrees:
+                self.doubt = self.off
+            self.differing = 0 if self.agrees else self.differing + 1
+            self.seconds, self.counted, self.reported, self.off = 0.0, 0.0, 0.0, NONE
+
+    @property
+    def wrong(self) -> bool:
+        """Whether the configured number of counts is wrong."""
+        return self.differing >= WRONG_WINDOWS
 
 
 def _signed(difference: int) -> int:
