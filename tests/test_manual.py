@@ -84,25 +84,30 @@ def test_the_page_of_the_counters_has_each_name_that_the_product_counts() -> Non
 
 @pytest.fixture(scope="module")
 def site(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
-    """Build the manual strictly, and return the text of each of its HTML files by name."""
+    """Build the manual strictly, and return the text of its pages and of the sketch by name."""
     out = tmp_path_factory.mktemp("built") / "manual.zip"
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(manual, "MANUAL", out)
         runpy.run_path(str(HERE / "build.py"), run_name="__main__")
     with ZipFile(out) as files:
-        return {
-            name: files.read(name).decode() for name in files.namelist() if name.endswith(".html")
-        }
+        names = [name for name in files.namelist() if name.endswith((".html", ".ino"))]
+        return {name: files.read(name).decode() for name in names}
 
 
 def test_the_manual_builds_strictly_and_loads_nothing_from_other_servers(
     site: dict[str, str],
 ) -> None:
     assert {page.replace(".md", ".html") for page in pages()} <= set(site)
-    for name, text in site.items():
+    for name in site.keys() - {"howto/acsar.ino"}:
+        text = site[name]
         loads = re.findall(r'<(?:script|link|img|iframe)\b[^>]*\b(?:src|href)="?([^" >]+)', text)
         assert loads
         assert not [target for target in loads if "//" in target], name
         bare = re.sub(r"<pre.*?</pre>|<script.*?</script>", "", text, flags=re.S)
         unrendered = re.findall(r"^(?:- |\||```|===).*", bare, re.M)
         assert not unrendered, f"{name}: a list or table needs an empty line before it"
+
+
+def test_the_manual_contains_the_sketch_of_its_version(site: dict[str, str]) -> None:
+    assert 'href="acsar.ino"' in site["howto/flash.html"]
+    assert site["howto/acsar.ino"] == text_of("deploy/firmware/acsar/acsar.ino")

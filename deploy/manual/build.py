@@ -18,6 +18,8 @@ from pathlib import Path
 from zipfile import ZIP_DEFLATED, ZipFile, ZipInfo
 
 HERE = Path(__file__).resolve().parent
+REPOSITORY = "https://github.com/acsard/acsard/blob/HEAD"
+SKETCH = "firmware/acsar/acsar.ino"
 
 
 def build(out: Path) -> None:
@@ -26,6 +28,10 @@ def build(out: Path) -> None:
         # zensical keeps a cache beside its sources.
         shutil.copytree(HERE / "pages", Path(place, "pages"))
         shutil.copy(HERE / "mkdocs.yml", place)
+        # A robot without internet has the sketch of its version, beside the page that leads to it.
+        shutil.copy(HERE.parent / SKETCH, Path(place, "pages/howto"))
+        flash = Path(place, "pages/howto/flash.md")
+        flash.write_text(flash.read_text().replace(f"{REPOSITORY}/deploy/{SKETCH}", "acsar.ino"))
         program = [sys.executable, "-m", "zensical", "build", "--strict", "-f", "mkdocs.yml"]
         done = subprocess.run(program, cwd=place, capture_output=True, text=True, check=False)
         if done.returncode:
