@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import grp
 import os
-import re
 import shutil
 import subprocess
 import sys
@@ -194,7 +193,6 @@ UNIT_DIRECTORY, PACKAGE_UNIT_DIRECTORY = (
 )
 RULES = Path("/etc/udev/rules.d/70-acsar.rules")
 CONFIG_DIRECTORY = Path("/etc/acsard")
-LAN_DROP_IN = "lan.conf"
 COMMAND = Path("/usr/local/bin/acsard")  # in the PATH of every user, also under sudo
 PROGRAM = versions.HOME / versions.CURRENT / "bin" / "acsard"
 TLS_DIRECTORY = "/etc/acsard/tls"  # in the drop-in `lan.conf`
@@ -253,38 +251,18 @@ def system_files(deploy: Path) -> list[File]:
     ]
 
 
-def lan_drop_in(unit: str) -> File:
-    """Return the drop-in `lan.conf`: local network and certificates for a unit."""
-    return File(
-        UNIT_DIRECTORY / f"{unit}.d" / LAN_DROP_IN,
-        (source() / "systemd" / LAN_DROP_IN).read_bytes(),
-    )
+def admitting(directory: Path) -> Write | None:
+    """Return the step that lets the service's TLS gateway use the certificates in a directory.
 
-
-def admitting(directory: Path) -> Write | Keep | None:
-    """Return the step that lets the service's TLS gateway use these certificates.
-
-    Its drop-in permits more than loopback, and root's files. Of an existing one only the paths
-    change: the user may have restricted the networks. Return None without the service or root.
+    Its drop-in `lan.conf` permits more than loopback, and root's files in `TLS_DIRECTORY`. One that
+    is there stays: the user may have restricted the networks.
     """
-    units = [place / GATEWAY for place in (UNIT_DIRECTORY, PACKAGE_UNIT_DIRECTORY)]
-    if os.geteuid() != 0 or not any(unit.exists() for unit in units):
+    place = UNIT_DIRECTORY / f"{GATEWAY}.d" / "lan.conf"
+    units = [there / GATEWAY for there in (UNIT_DIRECTORY, PACKAGE_UNIT_DIRECTORY)]
+    served = os.geteuid() == 0 and any(unit.exists() for unit in units)
+    if not served or place.exists() or directory != Path(TLS_DIRECTORY):
         return None
-    file = lan_drop_in(GATEWAY)
-    return admitted(file, file.current_content(), directory)
-
-
-def admitted(file: File, content: bytes | None, directory: Path) -> Write | Keep:
-    """Return the step that writes the directory of certificates into a drop-in, if needed."""
-    place = str(directory).encode()
-    text = re.sub(
-        rb'(?m)^(LoadCredential=[\w.-]+:|ExecReload=.*cd ")[^"\n]*(/[^/"\n]+|" && .*)$',
-        lambda match: match[1] + place + match[2],
-        file.content if content is None else content,
-    )
-    if text == content:
-        return Keep(file.path, "it already names the directory of the certificates")
-    return Write(File(file.path, text))
+    return Write(File(place, (source() / "systemd" / "lan.conf").read_bytes()))
 
 
 def installing(wanted: Iterable[File], *, force: bool) -> list[Step]:

@@ -31,7 +31,6 @@ from acsard.machine.service_installation import (
     Remove,
     Run,
     Write,
-    admitted,
     files,
     installing,
     missing_prerequisite,
@@ -148,21 +147,6 @@ def test_the_files_are_those_of_deploy_with_the_port_of_a_real_robot() -> None:
     unit, gateway, page, _, configuration = files()
     assert (unit.path.name, gateway.path.name, page.path.name) == (UNIT, GATEWAY, PAGE)
     assert b'port = "/dev/acsar"' in configuration.content
-
-
-DROP_IN = File(
-    Path("/etc/x/lan.conf"),
-    b"IPAddressAllow=10.0.0.0/8\nLoadCredential=key.pem:/a/b/key.pem\n"
-    b"ExecReload=+/bin/sh -c 'cd \"/a/b\" && install key.pem %t/%N'\n",
-)
-
-
-def test_networks_that_the_user_has_restricted_are_kept() -> None:
-    own = b"IPAddressAllow=10.1.2.0/24\nLoadCredential=key.pem:/srv/tls/key.pem\n"
-    assert isinstance(admitted(DROP_IN, own, Path("/srv/tls")), Keep)
-    moved = admitted(DROP_IN, own, Path("/etc/tls"))
-    assert isinstance(moved, Write)
-    assert moved.file.content == own.replace(b"/srv/tls", b"/etc/tls")
 
 
 def test_after_a_write_and_a_removal_the_directory_is_unchanged(tmp_path: Path) -> None:
