@@ -7,7 +7,6 @@ ones, whose speed jumps from line to line, it costs metres.
 
 from __future__ import annotations
 
-import math
 from typing import Literal
 
 from msgspec import Struct
@@ -16,10 +15,9 @@ from acsard.core.codes import PoseCode
 from acsard.core.link.feedback import Timeline
 from acsard.core.link.line_times import NARROW_DEVIATION
 from acsard.core.link.link_setup import LinkSetup
+from acsard.core.link.quantization import COARSE_ANGLE
 
 WINDOW_LINES = 500  # 5 s at 100 Hz
-
-COARSE_ANGLE = math.tau / 200  # rad of one count
 
 MAX_LOST_FRACTION = 0.01
 
@@ -37,7 +35,7 @@ class PoseDoubt(Struct):
     def judge(self, setup: LinkSetup, timeline: Timeline, lines: int, coarse_lines: int) -> bool:
         """Judge the last `WINDOW_LINES`, and return whether the code has changed.
 
-        `coarse_lines` are those whose speeds jump, while the counts per turn are not configured.
+        `coarse_lines` are those whose speeds have large steps, without configured counts per turn.
         """
         if timeline.counts_check.wrong:
             before, self.code = self.code, "encoder_counts_wrong"

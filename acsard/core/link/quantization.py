@@ -28,10 +28,8 @@ STEP_RANK = 3  # the third largest, because one damaged line causes two large ch
 # Times the second largest among the wheels: random jumps look like quantization.
 MAX_STEP_RATIO = 3.0
 
-# Mean jump, rad per line, of an encoder with 200 counts a turn, above which it is coarse; gain.
-COARSE, JUMP_GAIN = 0.015, 0.06
-
-MAX_INTERVAL_S = 0.03  # over a longer time, accelerations look like jumps
+# Of a count. Over a longer time than this, a change of speed is an acceleration.
+COARSE_ANGLE, MAX_INTERVAL_S = math.tau / 200, 0.03
 
 NO_STEPS = (0.0, 0.0, 0.0, 0.0)
 
@@ -68,39 +66,12 @@ class Steps(Struct):
             self.largest = [0.0] * STEP_RANK
 
 
-class Coarseness(Struct):
-    """Detects wheel speeds that jump back and forth from line to line, as with coarse encoders.
-
-    The jump of speeds v0, v1, v2 in successive lines is |v0 - 2 v1 + v2| dt / 2. A change of the
-    acceleration causes one, too, but only in one line.
-    """
-
-    rows: tuple[Motors, Motors] = (NO_STEPS, NO_STEPS)  # the last two lines
-    jumps: list[float] = field(default_factory=lambda: [0.0] * 4)  # rad per line
-    wheel: int = 0  # of the last line
-
-    def add(self, speeds: Motors, elapsed_s: float) -> bool:
-        """Return whether the encoder is coarse that it is the turn of, by the speeds of a line.
-
-        Return False after more than `MAX_INTERVAL_S`, or if all speeds were and are 0.
-        """
-        (older, before), self.rows = self.rows, (self.rows[1], speeds)
-        if speeds == NO_STEPS == before or elapsed_s > MAX_INTERVAL_S:
-            return False
-        # One wheel per line keeps every control step short.
-        wheel = self.wheel = (self.wheel + 1) % 4
-        mean, jump = self.jumps[wheel], abs(older[wheel] - 2 * before[wheel] + speeds[wheel])
-        self.jumps[wheel] = mean = mean + JUMP_GAIN * (elapsed_s / 2 * jump - mean)
-        return mean > COARSE
-
-
 def _unknown() -> tuple[Steps, Steps, Steps, Steps]:
     return Steps(), Steps(), Steps(), Steps()
 
 
 class CountRecovery(Struct):
     whole: WholeCounts = field(default_factory=WholeCounts)
-    coarseness: Coarseness = field(default_factory=Coarseness)
     wheels: tuple[Steps, Steps, Steps, Steps] = field(default_factory=_unknown)
     learned: Motors = NO_STEPS
     steps: Motors = NO_STEPS  # limited by `MAX_STEP_RATIO`
@@ -108,7 +79,7 @@ class CountRecovery(Struct):
 
     def forget(self) -> None:
         """Forget all earlier lines: the board has restarted or was replaced."""
-        self.whole, self.coarseness, self.wheels = WholeCounts(), Coarseness(), _unknown()
+        self.whole, self.wheels = WholeCounts(), _unknown()
         self.learned = self.steps = NO_STEPS
 
     def counts(self, configured: int) -> tuple[int, ...]:
@@ -133,8 +104,6 @@ class CountRecovery(Struct):
             # One count is a step of this size; none is learned.
             step = angle / elapsed_s if elapsed_s > 0.0 else 0.0
             return replace(line, counted=counted, steps=(step, step, step, step), count=angle)
-        if elapsed_s > 0.0 and self.coarseness.add(speeds, elapsed_s):
-            self.coarse_lines += 1
         a, b, c, d = self.wheels
         a.add(speeds[0])
         b.add(speeds[1])
@@ -145,4 +114,6 @@ class CountRecovery(Struct):
             most = MAX_STEP_RATIO * sorted(reported)[2]
             self.learned = reported
             self.steps = min(a.size, most), min(b.size, most), min(c.size, most), min(d.size, most)
+        if elapsed_s < MAX_INTERVAL_S and COARSE_ANGLE < max(self.steps) * elapsed_s < math.inf:
+            self.coarse_lines += 1
         return replace(line, steps=self.steps)
