@@ -54,12 +54,6 @@ VERBS = {
 
 UNLISTED = ("gateway",)  # started only by systemd and `acsard run`
 
-# Their exit code says whether something was done or judged, so they fail if the reader of their
-# output ends early. An action such as `recording replay` sets `must_finish` instead.
-MUST_FINISH = {
-    "move", "call", "set", "doctor", "mcu", "calibrate", "tls", "service",
-}  # fmt: skip
-
 _EPILOG = """\
 exit codes: 0 done, 1 failure, 2 wrong usage, 65 part of the recording was left out, 66 no such
 port, 69 daemon unreachable, 75 port, bus address or robot id in use, 77 no permission, 78 bad
@@ -158,13 +152,11 @@ def main(argv: list[str] | None = None) -> int:
     known = {"-h", "--help", "--version"}
     if not words or (words[0].startswith("-") and words[0] not in known):
         words.insert(0, "run")
-    must_finish = words[0] in MUST_FINISH
-    code: int = Exit.FAILURE if must_finish else Exit.OK
+    code: int = Exit.OK
     try:
         try:
             is_known = words[0] in VERBS or words[0] in UNLISTED
             args = (parser(words[:1], words[:1]) if is_known else parser(())).parse_args(words)
-            must_finish = must_finish or getattr(args, "must_finish", False)
             code = int(args.main(args))
         except AcsardError as error:
             print(f"acsard: {lines(str(error))}", file=sys.stderr)
@@ -175,13 +167,12 @@ def main(argv: list[str] | None = None) -> int:
         if not isinstance(error, BrokenPipeError) and error.errno != errno.ENOSPC:
             raise
         # The program that reads this output (head, less) has ended, or the disk of the output or of
-        # another file is full.
+        # another file is full. An exit code that says what was done or judged must not be 0 then.
         if not isinstance(error, BrokenPipeError):
             with suppress(OSError):
                 print(f"acsard: {error}", file=sys.stderr)
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        failed = must_finish or not isinstance(error, BrokenPipeError)
-        return code or (Exit.FAILURE if failed else Exit.OK)
+        return code or Exit.FAILURE
     except KeyboardInterrupt:
         return 130
     return code

@@ -103,7 +103,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         description=REPORT_DESCRIPTION,
     )
     view.set_defaults(main=main_show)
-    replay.set_defaults(main=main_replay, must_finish=True)
+    replay.set_defaults(main=main_replay)
     exported.set_defaults(main=main_export)
     drawn.set_defaults(main=main_report)
     for action in (view, replay, exported, drawn):
