@@ -127,7 +127,7 @@ class ControlLoop:
         # which are free only while this loop waits.
         if due or news is not QUIET:
             publication.publish(news, robot.applied if due else None)
-        publication.bus.flush()
+        publication.bus.output.flush()
         return now, news, due, line
 
     def _heard(self, now: Instant, period: Period) -> Heard:
@@ -184,7 +184,7 @@ class ControlLoop:
         self._keeper.wait()
         self.publication.now = now
         self.publication.answer(last=True)
-        self.publication.bus.flush()
+        self.publication.bus.output.flush()
 
     def keep_last_stops(self, now: Instant) -> None:
         """Store the stops that arrived after the last wake-up, which none will process."""

@@ -138,7 +138,7 @@ async def run(
         async with _patience(config, log, manager):
             await stack.enter_async_context(bus)
         if simulated is not None:
-            simulated.publish_on(bus)
+            simulated.publish_on(bus.output)
         between = stack.enter_context(ExitStack())
         await stack.enter_async_context(port)
         # Read the latches after the bus and the port are open. A second daemon for this robot then
@@ -269,7 +269,7 @@ async def _patience(config: Config, log: Log, manager: Systemd) -> AsyncIterator
 
 async def _repeat_latched(bus: ZenohBus, publication: Publication) -> None:
     while True:
-        bus.publish("tf_static", publication.report.tf_static())
+        bus.output.publish("tf_static", publication.report.tf_static())
         await asyncio.sleep(LATCHED_PERIOD_S)
 
 

@@ -83,20 +83,20 @@ class Publication:
         # Answers, with the time at which each was queued, until the disk has the latches.
         self._answers: deque[tuple[int, Answer]] = deque()
         self.now = start  # of the present wake-up
-        bus.feedback_sent = self.stopwatch.figures["feedback_to_bus"].add
+        bus.output.feedback_sent = self.stopwatch.figures["feedback_to_bus"].add
 
     def publish(self, news: News, applied: Twist | None) -> None:
         """Publish the messages that are due after this wake-up, and log its events.
 
         `applied` is the twist in a line that was due.
         """
-        bus, report, now, config = self.bus, self.report, self.now, self._robot.config
-        is_new, wanted = config is not self._config, bus.wanted_keys
+        output, report, now, config = self.bus.output, self.report, self.now, self._robot.config
+        is_new, wanted = config is not self._config, output.wanted_keys
         if is_new:
             self._use(config, news.answers)
         if applied is not None or news.events or news.status_changed:
             for key, message in report.others_due(now, news, applied, wanted, self._snapshot):
-                bus.publish(key, message)
+                output.publish(key, message)
         for answer in news.answers:
             self._answers.append((now.mono_ns, answer))
         if self._answers:
@@ -107,12 +107,12 @@ class Publication:
             self.adopted(config)
         # These may be sent here, so they are last.
         if applied is not None and report.beat_due(now.mono_ns, wanted):
-            bus.publish_beat(self._beat())
+            output.publish_beat(self._beat())
         for estimate in news.estimates:
             if estimate.asked_ns is not None:
                 self.stopwatch.round_trip(estimate.heard_ns - estimate.asked_ns)
             for topic in report.feedback_due(estimate, wanted):
-                bus.publish_feedback(topic, estimate)
+                output.publish_feedback(topic, estimate)
 
     def answer(self, *, last: bool = False) -> None:
         """Send the answers whose latches are stored, or that wait for too long, or all (`last`)."""

@@ -62,18 +62,12 @@ class Pulse:
             self._periods.close()
             self._alarm.close()
 
-    def __call__(self, now: Instant) -> None:
-        if self._step is None:
-            return  # during a step, which must not take the next period's end, or after the last
-        # After a stall, the periods that have ended meanwhile count before this event.
-        self._run(now, NO_PERIOD if now.mono_ns < self._next_ns else self._ended(now))
-
     def _period_ended(self) -> None:
         now = clock.now()
         period = self._ended(now)
         # A step for another event may have counted the period.
         if period is not NO_PERIOD:
-            self._run(now, period)
+            self(now, period)
 
     def _ended(self, now: Instant) -> Period:
         expired = self._periods.expirations()
@@ -95,10 +89,15 @@ class Pulse:
             self._alarm_ns = None
             self(clock.now())
 
-    def _run(self, now: Instant, period: Period) -> None:
-        step, pace = self._step, self._pace
+    def __call__(self, now: Instant, period: Period = NO_PERIOD) -> None:
+        step = self._step
         if step is None:
-            return  # during a step, such as for a port that it has found lost, or after the last
+            # During a step, such as for a port that it has found lost, before the first one or
+            # after the last.
+            return
+        if period is NO_PERIOD and now.mono_ns >= self._next_ns:
+            # After a stall, the periods that have ended meanwhile count before this event.
+            period = self._ended(now)
         self._step, self._command_waits = None, False
         try:
             if not step(now, period):
@@ -108,6 +107,7 @@ class Pulse:
             # A bug in a step must end the process: as an error of `run`, which the daemon reports.
             self._over.set_exception(error)
             return
+        pace = self._pace
         self._step, retry_ns = step, pace.retry_ns
         if retry_ns != self._alarm_ns:
             self._alarm_ns = retry_ns

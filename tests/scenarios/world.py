@@ -132,7 +132,7 @@ class MemoryBus:
     """
 
     def __init__(self, wanted: Collection[str]) -> None:
-        self.wanted_keys = set(wanted)
+        self.output, self.wanted_keys = self, set(wanted)
         self.published: dict[str, deque[Message]] = {}
         self.feedback_sent: Callable[[int], object] = list[int]().append
         self.replies: dict[int, list[Reply]] = {}

@@ -132,14 +132,14 @@ def test_an_error_of_the_thread_ends_the_control_loop() -> None:
     bus, publisher = ZenohBus(Config(), WAKER), Bus(direct=False)
     publisher.put = fails  # type: ignore[method-assign]
     session: Any = publisher
-    bus._outlets.declare(session, "cmd_vel_out", "cmd_vel_out", "msgpack", "")
-    bus._outlets.start()
-    bus.publish("cmd_vel_out", Twist(Vector3(), Vector3()))
-    bus.flush()
-    bus._outlets.stop(WAIT_S)
+    bus.output.declare(session, "cmd_vel_out", "cmd_vel_out", "msgpack", "")
+    bus.output.start()
+    bus.output.publish("cmd_vel_out", Twist(Vector3(), Vector3()))
+    bus.output.flush()
+    bus.output.stop(WAIT_S)
     publisher.outlets.stop(WAIT_S)
     with pytest.raises(ValueError, match="a bug"):
-        bus.flush()
+        bus.output.flush()
 
 
 # feedback, which the control loop sends itself
@@ -159,7 +159,7 @@ NETWORK = BusConfig(connect=("tls/192.0.2.1:7447",))
 def test_the_control_loop_sends_feedback_itself_only_if_all_clients_use_exact_keys(
     config: Config, direct: bool
 ) -> None:
-    assert ZenohBus(config, WAKER)._outlets._direct == direct
+    assert ZenohBus(config, WAKER).output._direct == direct
 
 
 def test_after_a_slow_put_the_thread_sends_feedback_until_it_is_fast_again(

@@ -39,7 +39,7 @@ class Steps:
 
     def wake(self, period: Period = NO_PERIOD) -> None:
         """Run a step, at the end of a period or not."""
-        self.pulse._run(clock.now(), period)
+        self.pulse(clock.now(), period)
 
     @asynccontextmanager
     async def running(self, seconds: float, period_ns: int = LONG_NS) -> AsyncIterator[Pulse]:
@@ -65,6 +65,8 @@ def count_all(steps: Steps) -> None:
 
 async def test_each_period_that_ends_runs_one_step() -> None:
     steps = Steps()
+    steps.wake()  # a signal during the start, before the first step
+    assert steps.all == []
     async with steps.running(0.2, PERIOD_NS):
         pass
     count_all(steps)

@@ -46,22 +46,12 @@ class Waker(Protocol):
         """Report a stop."""
 
 
-class Bus(Protocol):
-    """The methods of the bus that the control loop calls."""
+class BusOutput(Protocol):
+    """The keys that the daemon publishes."""
 
     @property
     def wanted_keys(self) -> AbstractSet[str]:
         """The keys, such as "odom", that are latched or have a subscriber."""
-
-    def take(self, queries: int) -> BusInput:
-        """Return the input since the last call, with at most `queries` queries.
-
-        Their order is: service calls, one slow one (ROS parameters, `set`), which comes even beyond
-        the limit, and others. The rest waits.
-        """
-
-    def look(self) -> BusHealth:
-        """Return what has happened to the bus since the last call; call it ten times a second."""
 
     # Gets the time from the read of a feedback line until Zenoh had its message, in any thread.
     feedback_sent: Callable[[Ns], object]
@@ -80,6 +70,24 @@ class Bus(Protocol):
 
     def flush(self) -> None:
         """Start to send the queued messages, without waiting. Call this at the end of a step."""
+
+
+class Bus(Protocol):
+    """What the control loop uses of the bus."""
+
+    @property
+    def output(self) -> BusOutput:
+        """The keys that the daemon publishes."""
+
+    def take(self, queries: int) -> BusInput:
+        """Return the input since the last call, with at most `queries` queries.
+
+        Their order is: service calls, one slow one (ROS parameters, `set`), which comes even beyond
+        the limit, and others. The rest waits.
+        """
+
+    def look(self) -> BusHealth:
+        """Return what has happened to the bus since the last call; call it ten times a second."""
 
     def reply(self, reply: Reply) -> None:
         """Send a reply to the query of `reply.ticket`."""

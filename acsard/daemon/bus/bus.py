@@ -7,7 +7,6 @@ event loop.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
 from functools import partial
 
 import zenoh
@@ -17,12 +16,11 @@ from acsard.bus.zenoh_sessions import daemon_session
 from acsard.core.config.settings import Config
 from acsard.core.incoming.bus_interface import BusHealth, Waker
 from acsard.core.incoming.imu import SIMULATOR_SENDER
-from acsard.core.incoming.queries import Reply
 from acsard.core.messages.keys_and_roles import IMU, Topic, full_key, json_key, offered, published
 from acsard.core.messages.signature import Signature
 from acsard.core.ros.names import gid
 from acsard.core.ros.transports import Endpoint, claims, endpoints, left_out, node_tokens
-from acsard.core.values import NS_PER_S, Ns
+from acsard.core.values import NS_PER_S
 from acsard.daemon.bus.inbox import Inbox, Replies
 from acsard.daemon.bus.outlets import Outlets
 from acsard.daemon.bus.router_links import RouterLinks
@@ -55,37 +53,16 @@ class ZenohBus:
         # only. A router, a wildcard or a client without a certificate can lock the session's tables
         # for seconds, and the first put that meets the lock would already cost periods.
         lockable = config.bus.connect or config.bus.insecure or config.access.wildcards
-        outlets = self._outlets = Outlets(self._thread_errors, direct=not lockable)
-        # A method of this class would be one more call for each message and wake-up.
-        self.publish, self.publish_feedback = outlets.publish, outlets.publish_feedback
-        self.publish_beat, self.flush = outlets.publish_beat, outlets.flush
+        self.output = Outlets(self._thread_errors, direct=not lockable)
+        # Methods of this class would be one more call in each wake-up.
         self.take = self._inbox.take
+        self.reply, self.retire = self._replies.send, self._replies.retire
         self._links = RouterLinks(config.bus, self._thread_errors)
         self._session: zenoh.Session
         self._entities: list[object] = []  # Zenoh undeclares an entity when nothing refers to it
 
-    # The control loop calls the methods below, which `Bus` describes.
-
-    @property
-    def wanted_keys(self) -> frozenset[str]:
-        return self._outlets.wanted
-
     def look(self) -> BusHealth:
-        return BusHealth(*self._outlets.losses(clock.mono_ns()), self._links.changes.pop())
-
-    @property
-    def feedback_sent(self) -> Callable[[Ns], object]:
-        return self._outlets.feedback_sent
-
-    @feedback_sent.setter
-    def feedback_sent(self, record: Callable[[Ns], object]) -> None:
-        self._outlets.feedback_sent = record
-
-    def reply(self, reply: Reply) -> None:
-        self._replies.send(reply)
-
-    def retire(self, ticket: int) -> None:
-        self._replies.retire(ticket)
+        return BusHealth(*self.output.losses(clock.mono_ns()), self._links.changes.pop())
 
     # Opening the session.
 
@@ -121,7 +98,7 @@ class ZenohBus:
             self._declare_ros(session, endpoint)
         for token in (self._alive, *claims(ros), *node_tokens(ros, zid)):
             self._entities.append(session.liveliness().declare_token(token))
-        self._outlets.start()
+        self.output.start()
         self._links.start(session)
         return session
 
@@ -159,7 +136,7 @@ class ZenohBus:
         for topic in published(self._config):
             key = full_key(self._id, topic.key)
             signed = Signature(SIMULATOR_SENDER).pack() if topic.key == IMU else b""
-            self._outlets.declare(
+            self.output.declare(
                 session, topic.key, key, "msgpack", topic.type, topic.latched, signed=signed
             )
             self._declare_json(session, topic)
@@ -170,7 +147,7 @@ class ZenohBus:
         key = full_key(self._id, below)
         # The publisher is not latched: a latched publisher encodes every message even without
         # subscribers. A late subscriber can query the key for the newest message instead.
-        self._outlets.declare(session, topic.key, key, "json", topic.type)
+        self.output.declare(session, topic.key, key, "json", topic.type)
         on_query = direct(partial(self._inbox.on_query, below))
         self._entities.append(session.declare_queryable(key, on_query))
 
@@ -186,7 +163,7 @@ class ZenohBus:
                 self._entities.append(session.declare_queryable(key, on_query, complete=True))
             case "out":
                 identity = gid(endpoint.token) if endpoint.transport == "rmw" else b""
-                self._outlets.declare(
+                self.output.declare(
                     session, endpoint.native, key, "cdr", "", endpoint.latched, identity
                 )
         if endpoint.token:
@@ -203,7 +180,7 @@ class ZenohBus:
             pass
 
     def _close(self) -> None:
-        self._outlets.stop(CLOSE_TIMEOUT_S)
+        self.output.stop(CLOSE_TIMEOUT_S)
         self._links.stop()
         self._session.close()
 

@@ -85,7 +85,7 @@ class Outlets:
         self._listeners: list[object] = []  # Zenoh ends a listener when nothing refers to it
         self._counting = Lock()
         # Native keys with a subscriber or a latched publisher.
-        self.wanted: frozenset[str] = frozenset()
+        self.wanted_keys: frozenset[str] = frozenset()
         self._slots: dict[str, Mailbox[_Send]] = {}
         self._sent = 0  # messages that the control loop has sent itself since the last `flush`
         self.feedback_sent: Callable[[Ns], object] = _ignore
@@ -98,10 +98,10 @@ class Outlets:
 
     def _count(self, outlet: _Outlet, wanted: bool) -> None:
         # Several threads of Zenoh call this method, so it takes a lock. It replaces the set
-        # `wanted` as a whole, because the control loop may be reading the set.
+        # `wanted_keys` as a whole, because the control loop may be reading the set.
         with self._counting:
             outlet.wanted = wanted
-            self.wanted = frozenset(
+            self.wanted_keys = frozenset(
                 topic
                 for topic, outlets in list(self._outlets.items())
                 if any(sibling.wanted for sibling in outlets)
@@ -135,7 +135,7 @@ class Outlets:
             and self._sent <= MAX_DIRECT
             and not self._slots[topic].waiting
             and self._began_ns is None
-            and self._slow.isdisjoint(self.wanted)
+            and self._slow.isdisjoint(self.wanted_keys)
         )
 
     def flush(self) -> None:

@@ -13,7 +13,7 @@ import tty
 from typing import Self, get_args
 
 from acsard.core.config.settings import Baud, Config
-from acsard.core.incoming.bus_interface import Bus
+from acsard.core.incoming.bus_interface import BusOutput
 from acsard.core.messages.keys_and_roles import IMU
 from acsard.core.messages.schema import Message
 from acsard.core.simulator.baud_mismatch import garbled
@@ -131,26 +131,26 @@ class Simulated(SimPty):
     def __init__(self, config: Config) -> None:
         super().__init__(WatchedMcu(config, clock.mono_ns(), self._see))
         self._frame, self._gyro = config.odometry.base_frame, config.odometry.gyro
-        self._bus: Bus | None = None
+        self._output: BusOutput | None = None
         self._last: tuple[Observation, int] | None = None
 
-    def publish_on(self, bus: Bus) -> None:
+    def publish_on(self, output: BusOutput) -> None:
         """Publish the true pose and the gyro's samples from now on."""
-        self._bus = bus
+        self._output = output
 
     def current(self, key: str) -> Message | None:
         """Return the newest true pose for the key `sim/pose`."""
         return true_pose(*self._last) if key == TRUE_POSE_KEY and self._last is not None else None
 
     def _see(self, sight: Observation) -> None:
-        now, bus = clock.now(), self._bus
+        now, output = clock.now(), self._output
         wall_ns = now.wall_ns - (now.mono_ns - sight.at_ns)
         self._last = sight, wall_ns
-        if bus is None:
+        if output is None:
             return
-        if TRUE_POSE_KEY in bus.wanted_keys:
-            bus.publish(TRUE_POSE_KEY, true_pose(sight, wall_ns))
+        if TRUE_POSE_KEY in output.wanted_keys:
+            output.publish(TRUE_POSE_KEY, true_pose(sight, wall_ns))
         # The daemon receives this sample from the bus, like a sample of a gyro on a real robot.
         if self._gyro:
-            bus.publish(IMU, turn_rate(sight, self._frame, wall_ns))
-        bus.flush()
+            output.publish(IMU, turn_rate(sight, self._frame, wall_ns))
+        output.flush()
