@@ -9,12 +9,11 @@ from __future__ import annotations
 import json
 import os
 import re
-import sys
 from pathlib import Path
 
 import zenoh
 
-from acsard.bus.tls_files import CA, CERTIFICATE, KEY, files_in, require_usable
+from acsard.bus.tls_files import CA, CERTIFICATE, KEY, files_in, host_and_port, require_usable
 from acsard.bus.tls_trouble import RENEW_ADVICE, trouble
 from acsard.core.config.settings import TLS_PREFIX, Config, is_tls
 from acsard.core.messages.keys_and_roles import IMU, SPEED_LIMIT, full_key, source_keys
@@ -160,11 +159,11 @@ def answers(endpoint: str) -> bool:
     """Return whether a program accepts TCP connections at `endpoint`. Raises `UsageError`."""
     import socket
 
-    host, _, port = reachable(endpoint).partition("/")[2].rpartition(":")
+    host, port = host_and_port(reachable(endpoint))
     if not (host and port.isascii() and port.isdigit() and 0 < int(port) < 65536):
         raise no_endpoint(endpoint)
     try:
-        socket.create_connection((host.strip("[]"), int(port)), timeout=1.0).close()
+        socket.create_connection((host, int(port)), timeout=1.0).close()
     except UnicodeError:  # the host has an empty or too long part
         raise no_endpoint(endpoint) from None
     except OSError:
@@ -319,16 +318,5 @@ def first_line(error: Exception) -> str:
 
 def log_from_environment() -> None:
     """Start Zenoh's own log on standard output if RUST_LOG is set."""
-    if "RUST_LOG" not in os.environ:
-        return
-    from acsard.host.terminal_modes import may_use_color
-
-    before = os.environ.get("NO_COLOR")
-    # Zenoh reads only NO_COLOR, and would write colors to pipes and files too.
-    if not may_use_color(sys.stdout):
-        os.environ["NO_COLOR"] = "1"
-    zenoh.try_init_log_from_env()
-    if before is None:
-        os.environ.pop("NO_COLOR", None)
-    else:
-        os.environ["NO_COLOR"] = before
+    if "RUST_LOG" in os.environ:
+        zenoh.try_init_log_from_env()
