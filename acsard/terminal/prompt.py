@@ -277,12 +277,14 @@ def _wrapped(text: str) -> str:
 
 
 @contextmanager
-def ended_by_signals(notice: str = "", *, exits: bool = False) -> Iterator[None]:
+def ended_by_signals(
+    notice: str = "", *, exits: bool = False, restores: bool = True
+) -> Iterator[None]:
     """Raise `KeyboardInterrupt` in the `with` block when one of `PROMPT_END_SIGNALS` arrives.
 
     `notice` is then printed, and further signals are ignored until the end of the block, so that it
     can send zeros. If `exits` is true, a signal other than SIGINT raises `SystemExit` with 128 plus
-    its number.
+    its number. If `restores` is false, signals stay ignored after the block.
     """
     before = [signal.getsignal(number) for number in PROMPT_END_SIGNALS]
 
@@ -304,4 +306,4 @@ def ended_by_signals(notice: str = "", *, exits: bool = False) -> Iterator[None]
         yield
     finally:
         for number, handler in zip(PROMPT_END_SIGNALS, before, strict=True):
-            signal.signal(number, handler)
+            signal.signal(number, handler if restores else signal.SIG_IGN)

@@ -13,7 +13,6 @@ import errno
 import io
 import os
 import select
-import signal
 import sys
 import time
 from collections.abc import Callable, Iterator
@@ -27,6 +26,7 @@ from acsard.host import clock
 from acsard.host.logs import Writer
 from acsard.host.terminal_modes import single_key_mode
 from acsard.terminal.output import MAX_TEXT_WIDTH, plain, show
+from acsard.terminal.prompt import ended_by_signals
 from acsard.top import drive_screen
 from acsard.top.feed import Feed
 from acsard.top.fleet_table import table
@@ -41,11 +41,6 @@ TABLES_PERIOD_S = 0.5
 
 # Longest wait for a key before `acsard drive` does its other work.
 KEY_POLL_S = 0.05
-
-# Also Ctrl-Z (SIGTSTP), because a suspended program neither stops the robot nor leaves the screen.
-SCREEN_END_SIGNALS = (
-    signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT, signal.SIGTSTP,
-)  # fmt: skip
 
 
 def one_screen(feed: Feed) -> str:
@@ -137,24 +132,14 @@ def _be_lenient() -> None:
 
 @contextmanager
 def until_signal() -> Iterator[None]:
-    """End the `with` block when a signal of `SCREEN_END_SIGNALS` arrives or the terminal closes.
+    """End the `with` block when a signal arrives or the terminal closes.
 
     Further signals are ignored, also after it: two arrive when a terminal with a shell closes, and
     the second one must not interrupt the zeros that end a drive.
     """
-
-    def ignore_signals() -> None:
-        for number in SCREEN_END_SIGNALS:
-            signal.signal(number, signal.SIG_IGN)
-
-    def end_block(*_: object) -> None:
-        ignore_signals()
-        raise KeyboardInterrupt
-
-    for number in SCREEN_END_SIGNALS:
-        signal.signal(number, end_block)
     try:
-        yield
+        with ended_by_signals(restores=False):
+            yield
     except KeyboardInterrupt:
         pass
     except OSError as error:
@@ -162,8 +147,6 @@ def until_signal() -> Iterator[None]:
             raise
         # The terminal was closed, so discard further output.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-    finally:
-        ignore_signals()
 
 
 @contextmanager
