@@ -13,7 +13,7 @@ from msgspec import Struct
 from acsard.bus.address import require_id
 from acsard.bus.subscription import Subscription, queue_on
 from acsard.core.config.settings import is_tls
-from acsard.core.formatting import many
+from acsard.core.formatting import listed, many
 from acsard.core.messages.keys_and_roles import JSON_TREE, Topic, by_key, full_key, key_hint, row_of
 from acsard.core.messages.signature import Signature
 from acsard.core.values import ROOT_KEY
@@ -96,8 +96,8 @@ def no_robot_text(endpoint: str) -> str:
             "robot; `acsard doctor --id robot1` checks this"
         )
     return (
-        f"no robot is visible at {endpoint}; is a daemon running there, or is a daemon connected "
-        "to a router there?"
+        f"no robot is visible at {endpoint}: no daemon is running there, and no daemon is "
+        "connected to a router there; `acsard run` starts a daemon"
     )
 
 
@@ -148,9 +148,8 @@ def explain_silence(key: str, robot_id: str, endpoint: str, presence: Presence) 
         from difflib import get_close_matches
 
         # With a cutoff of 0.0, no robot is excluded, and the most similar ids come first.
-        near = get_close_matches(robot_id, presence.others, MAX_NAMED, 0.0)
-        more = len(presence.others) - len(near)
-        named = ", ".join(near) + (f" and {more} more (`acsard fleet` lists them)" if more else "")
+        near = get_close_matches(robot_id, presence.others, len(presence.others), 0.0)
+        named = listed(near, MAX_NAMED)
         return f"there is no robot {robot_id}. Robots here: {named}; use --id {near[0]}"
     if is_tls(endpoint):
         return (
@@ -158,10 +157,7 @@ def explain_silence(key: str, robot_id: str, endpoint: str, presence: Presence) 
             f"certificate does not permit you to see the robot; `acsard doctor --id {robot_id}` "
             "shows the role of your certificate"
         )
-    return (
-        f"no robot is visible at {endpoint}: no daemon is running there, and no daemon is "
-        "connected to a router there; `acsard run` starts a daemon"
-    )
+    return no_robot_text(endpoint)
 
 
 def _silent(key: str) -> str:

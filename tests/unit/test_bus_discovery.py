@@ -129,7 +129,7 @@ def absent(*others: str) -> Presence:
         ("state", "rob1t1", PLAIN, absent("acsar", "robot2", "robot1"),
          "there is no robot rob1t1. Robots here: robot1, robot2, acsar; use --id robot1"),
         ("state", "robot7", PLAIN, absent(*(f"robot{n:02}" for n in range(100))),
-         f"and {100 - MAX_NAMED} more (`acsard fleet` lists them)"),
+         f"and {100 - MAX_NAMED} more"),
         ("state", "acsar", PLAIN, absent(), f"no robot is visible at {PLAIN}"),
         ("state", "robot1", TLS, absent(), "`acsard doctor --id robot1`"),
         ("oddom", "acsar", PLAIN, Presence(linked=False, here=False),
