@@ -36,8 +36,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     forms = [f"{service} {names.upper()}" for service, names in needed.items() if names]
     parser.add_argument(
         "service",
-        # Accept `srv/stop` too, because the messages on `state` and the table of keys contain the
-        # name in this form.
+        # Accept `srv/stop` too, because the table of keys contains the name in this form.
         type=lambda word: word.removeprefix("srv/"),
         choices=_Known(CALLABLE_SERVICES),
         metavar="SERVICE",

@@ -19,7 +19,6 @@ from typing import Any
 
 import msgspec
 import zenoh
-from msgspec.structs import replace
 
 from acsard.bus.address import Address
 from acsard.bus.robot_discovery import NO_BATTERY, explain_silence, presence
@@ -31,7 +30,6 @@ from acsard.client.identity import ClientIdentity, identity
 from acsard.client.reads import Reads
 from acsard.client.ride import MAX_SOURCE_TIMEOUT_S, SEND_PERIOD_S
 from acsard.client.signing import Beats, CommandSigner
-from acsard.core.formatting import at_terminal
 from acsard.core.messages import schema
 from acsard.core.messages.encodings import (
     DecodeError,
@@ -308,8 +306,7 @@ class Connection(Reads):
                 require_size(verb, payload)
             except DecodeError as error:
                 return invalid_call(verb, error)
-        reply = Decoder(schema.ServiceReply).decode(*self.reply(key, payload))
-        return replace(reply, message=at_terminal(reply.message))
+        return Decoder(schema.ServiceReply).decode(*self.reply(key, payload))
 
     def _reply(self, name: str) -> tuple[str, bytes]:
         return self.reply(name)

@@ -125,7 +125,8 @@ stale
 set_back
     commands of {source} arrive {seconds:g} s later than its earliest ones, by their stamps: the
     sender's clock was set back, or its commands wait in a queue;
-    -> if the clock was set, restart the sender or call srv/activate; otherwise check the network
+    -> if the clock was set, restart the sender or type `acsard call activate`; otherwise check the
+    network
 stamps
     the stamps of {source} do not advance with time ({note});
     -> is use_sim_time on, or are the stamps copied from another message? Send the time of the
@@ -237,7 +238,7 @@ port_trouble
     {trouble}
 port_released
     the serial port is released to another program:
-    -> call srv/activate to open it again
+    -> type `acsard call activate` to open it again
 booting
     the port is open; waiting for the microcontroller's first good lines
 link_up

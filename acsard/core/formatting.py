@@ -58,15 +58,6 @@ def after_mode(mode: str, reason: str) -> str:
     return reason if reason.startswith(mode) else f"{mode}: {reason}"
 
 
-def at_terminal(text: str) -> str:
-    """Return a text of the daemon with the command to type instead of the service to call."""
-    return re.sub(
-        r"(call )?srv/(clear|activate)",
-        lambda found: f"{'type ' if found[1] else ''}`acsard call {found[2]}`",
-        text,
-    )
-
-
 def many(count: int, singular: str, more: str = "") -> str:
     """Return a count with its noun, such as `no lines`, `1 line` or `2 changes of mode`.
 

@@ -85,8 +85,8 @@ UNLATCHED = (Mode.DRIVING, Mode.READY)  # their reason depends only on the choic
 QUIET = News()
 
 PORT_LENT = (
-    "the serial port is closed; call srv/activate to open it again. The pose is unknown until "
-    "srv/reset_odometry or srv/set_pose"
+    "the serial port is closed; type `acsard call activate` to open it again. The pose is unknown "
+    "until `acsard call reset_odometry` or `acsard call set_pose`"
 )
 
 NOTHING_CHANGED = "nothing changed: all settings already have these values"
@@ -599,7 +599,7 @@ class Robot:
     def _fault(self, why: Reason, now: Instant, events: list[Event]) -> None:
         if self._life.fault(why, now):
             self._arbiter.require_neutral(self._last.made_ns)
-            text = f"{why.text}; srv/clear releases it"
+            text = f"{why.text}; `acsard call clear` releases it"
             events.append(Event("fault", text, "error", code=why.code))
 
     # Commands.

@@ -262,8 +262,8 @@ def test_a_drained_battery_warns_and_then_stops_the_robot_until_it_is_charged() 
     refused = world.call("clear")
     assert not refused.success
     assert refused.message == (
-        "battery below battery.stop_below = 10 %: charge the battery to 10.5 %, then call "
-        "srv/clear again"
+        "battery below battery.stop_below = 10 %: charge the battery to 10.5 %, then "
+        "type `acsard call clear` again"
     )
     with world.mcu.battery(90.0, 60.0):
         world.run(30.0)

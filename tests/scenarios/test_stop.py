@@ -86,7 +86,7 @@ def test_the_reason_of_each_mode_says_how_to_open_a_released_port(ask: str) -> N
     assert world.call(ask).success
     assert world.call("deactivate", RELEASE).success
     world.run(1.0)
-    assert "call srv/activate to open it again" in world.state.reason
+    assert "type `acsard call activate` to open it again" in world.state.reason
     if ask == "stop":
         assert world.state.mode == "stopped"
         world.call("clear")

@@ -385,7 +385,7 @@ class Witness:
             return
         self.counts["clear"] += 1
         self.arming(asked_ns)
-        left = text.startswith("cleared, but") and "call srv/clear again" in text
+        left = text.startswith("cleared, but") and "type `acsard call clear` again" in text
         until_ns = read_ns if left and read_ns is not None else asked_ns
         newest_ns = max([*self.faults, *self.stops, self.fault_ns or 0])
         both = self.stops and self.fault_ns is not None

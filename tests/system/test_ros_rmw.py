@@ -124,7 +124,7 @@ def test_an_independent_client_stops_and_clears_the_robot(fleet: Fleet) -> None:
     assert fleet.one.state()["mode"] == "stopped"
     refused = fleet.sdk.do("call", "/one/acsard/clear", TRIGGER)
     assert refused["success"] is False
-    assert "call srv/clear again 2 s after that" in refused["message"]
+    assert "type `acsard call clear` again 2 s after that" in refused["message"]
     clear = partial(fleet.sdk.do, "call", "/one/acsard/clear", TRIGGER)
     until(lambda: clear()["success"], 5.0, "a plain clear is obeyed")
     assert fleet.one.state()["mode"] == "ready"

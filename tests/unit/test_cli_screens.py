@@ -66,7 +66,9 @@ TOP = {
     "a silent robot": replace(SEEN, age=100.0, silent=True),
     "another version": replace(SEEN, age=3.0, undecodable=9, silent=True),
     "a robot with warnings": replace(SEEN, state=WARNED),
-    "a stopped robot": of(mode="stopped", code="stopped", reason="stopped by ann; call srv/clear"),
+    "a stopped robot": of(
+        mode="stopped", code="stopped", reason="stopped by ann; type `acsard call clear`"
+    ),
     "a simulator without a link": replace(
         of(link="down", settings_differ="limits.linear_speed = 0.2, not 1.0"),
         info=replace(INFO, simulated=True),
@@ -102,7 +104,9 @@ ENDS = {
 }
 
 READY = replace(STATE, mode="ready", code="no_command", reason="waiting for a command", linear=0.0)
-PRESSED = "emergency stop pressed at the robot; release it at the robot, then call srv/clear"
+PRESSED = (
+    "emergency stop pressed at the robot; release it at the robot, then type `acsard call clear`"
+)
 ROBOTS = {
     "driving": replace(STATE, speed_limit="0.3 m/s, set by x"),
     "ready": replace(READY, certificate="valid"),

@@ -12,7 +12,7 @@ from acsard.core.motion.arbiter_text import missed
 from acsard.core.values import NS_PER_S, Event, Instant
 from tests.unit.examples import OUTPUTS, SNAPSHOT, START, due, later
 
-FAULT = Event("fault", "a wheel is dead; srv/clear releases it", "error")
+FAULT = Event("fault", "a wheel is dead; `acsard call clear` releases it", "error")
 
 
 def test_events_are_kept_without_subscribers_and_published_with_earlier_events() -> None:

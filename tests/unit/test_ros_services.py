@@ -121,9 +121,9 @@ def test_a_request_to_set_parameters_returns_the_robot_s_answer(service: str, vi
     request = served(ros_query(f"parameters/{service}", via, set_request(0.7)), made)
     assert isinstance(request, Request)
     assert (request.verb, request.id, request.settings) == ("set", 7, {"limits.linear_speed": 0.7})
-    reply = made.answered(Answer(7, False, "call srv/clear first"), WALL_NS)
+    reply = made.answered(Answer(7, False, "stop first"), WALL_NS)
     assert reply is not None
-    no = rcl.SetParametersResult(False, "call srv/clear first")
+    no = rcl.SetParametersResult(False, "stop first")
     assert results(service, reply.payload) == [no]
     assert attached(reply) == echo(via)
     # A parameter that is set twice is refused with all its results.

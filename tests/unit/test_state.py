@@ -65,7 +65,7 @@ def test_a_mode_refuses_what_would_have_no_effect_and_says_why(mode: Mode, verb:
         return require_allowed(mode, verb)
     with pytest.raises(RefusedError) as caught:
         require_allowed(mode, verb)
-    assert ("call srv/clear first" in str(caught.value)) != down
+    assert ("`acsard call clear` first" in str(caught.value)) != down
     return None
 
 

@@ -217,9 +217,11 @@ def test_only_activate_ends_inactive_and_only_without_a_latched_stop() -> None:
     assert timed.off("joe") > off
     assert "still switched off by joe" in refusal(lambda: timed.activate(off))
     stop = timed.stop()
-    assert "call srv/clear first" in refusal(lambda: timed.activate(*timed.numbers))
+    assert "`acsard call clear` first" in refusal(lambda: timed.activate(*timed.numbers))
     refusal(timed.off)
-    assert "switched off: call srv/activate" in timed.life.clear((stop,), ns(timed.now_s))[0]
+    assert (
+        "switched off: type `acsard call activate`" in timed.life.clear((stop,), ns(timed.now_s))[0]
+    )
     assert timed.clear(*timed.numbers) == ()
     assert timed.activate(*timed.numbers)
     assert timed.mode is Mode.READY

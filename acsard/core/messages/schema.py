@@ -15,7 +15,6 @@ from typing import Annotated, get_args
 from msgspec import Meta, Struct, field
 
 from acsard.core.codes import Code, PoseCode, StateCode, WaitCode, received_text
-from acsard.core.formatting import at_terminal
 from acsard.core.link.link_state import State
 from acsard.core.messages.certificate_expiry import CertificateCode
 from acsard.core.messages.keys_and_roles import Direction
@@ -511,8 +510,8 @@ class RobotState(Message, frozen=True):
 
     @property
     def why(self) -> str:
-        """The reason for people at a terminal, with its code if this version does not know it."""
-        return at_terminal(received_text(self.code, self.reason))
+        """The reason, with its code if this version does not know it."""
+        return received_text(self.code, self.reason)
 
 
 class GatewayState(Message, frozen=True):

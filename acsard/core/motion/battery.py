@@ -214,8 +214,8 @@ class Battery(Struct):
         text = status_text(config, self.status)
         if level == "stop":
             why = empty_reason(config)
-            text = f"{text}; {why.advice}, then call srv/clear"
+            text = f"{text}; {why.advice}, then type `acsard call clear`"
             return Event("battery_stop", text, "error", code=why.code)
         if before == "stop" and level != "unknown":
-            text = f"{text}; the robot stays stopped until srv/clear is called"
+            text = f"{text}; the robot stays stopped until `acsard call clear`"
         return Event("battery", text, "info" if level == "ok" else "warning", kind=level)

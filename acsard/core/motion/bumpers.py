@@ -118,7 +118,7 @@ class Bumpers(BoardInput):
             return f"the board reports {many(count, 'bumper')}, and none is pressed"
         if before == "pressed" and _drives_away(safety):
             return "the bumpers are released and allow every direction again"
-        return "the bumpers are released; a latched stop lasts until srv/clear is called"
+        return "the bumpers are released; a latched stop lasts until `acsard call clear`"
 
     def _direction(self, safety: SafetyConfig) -> int:
         pressed = zip(safety.bumpers, self.pressed or (), strict=True)

@@ -127,7 +127,7 @@ class BoardInput(Struct):
 
     def advice(self, why: Reason, safety: SafetyConfig) -> str:
         """Return the instruction to the operator when an input is pressed."""
-        return f"{why.advice}, then call srv/clear"
+        return f"{why.advice}, then type `acsard call clear`"
 
     def _take(self, sign: Sign, pressed: tuple[bool, ...], safety: SafetyConfig) -> list[Event]:
         before, was = self.state, self.pressed or ()
@@ -190,7 +190,7 @@ class EmergencyStop(BoardInput):
     def released(self, before: EstopState, safety: SafetyConfig) -> str:
         if not before:
             return "the board reports an emergency-stop input, which is released"
-        return "the emergency stop is released; the robot stays stopped until srv/clear is called"
+        return "the emergency stop is released; the robot stays stopped until `acsard call clear`"
 
 
 _SILENT_NS = int(SILENCE_TIMEOUT_S * NS_PER_S)

@@ -110,7 +110,7 @@ class Lifecycle(Struct):
             self._use(stopped(self.latches, by, now.wall_ns))
         if self.shutting_down:
             return f"stopped and latched; {SHUTDOWN_REASON.text}"
-        return "stopped and latched; srv/clear releases it"
+        return "stopped and latched; `acsard call clear` releases it"
 
     def stop_of(self, by: str) -> tuple[int, ...]:
         """Return the number of a client's stop, or ()."""
@@ -126,14 +126,16 @@ class Lifecycle(Struct):
         """
         require_allowed(self.mode, "clear")
         if self.held:
-            raise RefusedError(f"{self.held.text}: {self.held.advice}, then call srv/clear again")
+            raise RefusedError(
+                f"{self.held.text}: {self.held.advice}, then type `acsard call clear` again"
+            )
         causes = self.latches.of("fault", "stop")
         if not causes:
             return "nothing to clear: the robot is neither stopped nor in fault", ()
         if asked_ns <= self.freed_ns:
             raise RefusedError(
-                "this call came before the cause of the stop or fault had ended: call srv/clear "
-                "again"
+                "this call came before the cause of the stop or fault had ended: type "
+                "`acsard call clear` again"
             )
         if numbers is None:
             self._require_shown(causes, asked_ns, "clear")
@@ -141,11 +143,14 @@ class Lifecycle(Struct):
         done = self._release(numbers, causes, "clear")
         left = self.latches.of("fault", "stop")
         if left:
-            return f"cleared, but the robot is still {in_force(left)}: call srv/clear again", done
+            text = (
+                f"cleared, but the robot is still {in_force(left)}: type `acsard call clear` again"
+            )
+            return text, done
         if self.latches.causes:
             return (
-                "cleared, but the robot is still switched off: call srv/activate to switch it on, "
-                f"then {ZERO_FIRST}"
+                "cleared, but the robot is still switched off: type `acsard call activate` to "
+                f"switch it on, then {ZERO_FIRST}"
             ), done
         return f"cleared; {ZERO_FIRST}", done
 
@@ -167,7 +172,7 @@ class Lifecycle(Struct):
         require_allowed(self.mode, "deactivate")
         why = reason("switched_off", by=by or NAMELESS)
         self._use(latched(self.latches, "inactive", why, now.wall_ns, by))
-        return "inactive: the robot brakes to rest; call srv/activate to switch it on again"
+        return "inactive: the robot brakes to rest; `acsard call activate` switches it on again"
 
     @property
     def why(self) -> Reason:
@@ -176,13 +181,13 @@ class Lifecycle(Struct):
         causes = (*self.latches.of("fault"), *self.latches.of("stop"))
         if not causes:
             (off,) = self.latches.of("inactive")
-            return Reason(off.code, f"{describe(off)}; call srv/activate")
+            return Reason(off.code, f"{describe(off)}; type `acsard call activate`")
         parts = [describe(cause) for cause in causes]
         if held is not None and not is_latched(held, causes):
             # For example, one of two pressed bumpers has been released.
             parts.append(held.text)
         before = "" if held is None else f"{held.advice}, then "
-        return Reason(causes[0].code, f"{'; also '.join(parts)}; {before}call srv/clear")
+        return Reason(causes[0].code, f"{'; also '.join(parts)}; {before}type `acsard call clear`")
 
     def _release(
         self, numbers: Collection[int], causes: tuple[Cause, ...], verb: str
@@ -191,9 +196,9 @@ class Lifecycle(Struct):
         if not done:
             present = ", ".join([str(cause.number) for cause in causes])
             raise RefusedError(
-                f"this call names no cause that srv/{verb} would release now; the robot is still "
-                f"{in_force(causes)}: look at the robot, then call srv/{verb} again with the "
-                f"numbers of the present `causes` in `state` ({present})"
+                f"this call names no cause that {verb} would release now; the robot is still "
+                f"{in_force(causes)}: look at the robot, then type `acsard call {verb}` again with "
+                f"the numbers of the present `causes` in `state` ({present})"
             )
         self._use(released(self.latches, done))
         return done
@@ -206,8 +211,8 @@ class Lifecycle(Struct):
             age_s = max(0.0, math.floor(since_s * 10) / 10)
             raise RefusedError(
                 f"the robot has shown for only {age_s:.1f} s that it is {in_force([newest])}: look "
-                f"at the robot, then call srv/{verb} again {SHOWN_S:g} s after that, or name the "
-                "numbers of the `causes` in `state`"
+                f"at the robot, then type `acsard call {verb}` again {SHOWN_S:g} s after that, or "
+                "name the numbers of the `causes` in `state`"
             )
 
     def _use(self, latches: Latches) -> None:

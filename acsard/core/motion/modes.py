@@ -60,10 +60,10 @@ REFUSALS: dict[tuple[Mode, Verb], str] = {
     (Mode.SHUTDOWN, "clear"): SHUTDOWN_REASON.text,
     (Mode.SHUTDOWN, "activate"): SHUTDOWN_REASON.text,
     (Mode.SHUTDOWN, "deactivate"): SHUTDOWN_REASON.text,
-    (Mode.FAULT, "activate"): "the robot is in fault: call srv/clear first",
-    (Mode.FAULT, "deactivate"): "the robot is in fault and cannot move: call srv/clear first",
-    (Mode.STOPPED, "activate"): "the robot is stopped: call srv/clear first",
-    (Mode.STOPPED, "deactivate"): "the robot is stopped and cannot move: call srv/clear first",
+    (Mode.FAULT, "activate"): "the robot is in fault: `acsard call clear` first",
+    (Mode.FAULT, "deactivate"): "the robot is in fault and cannot move: `acsard call clear` first",
+    (Mode.STOPPED, "activate"): "the robot is stopped: `acsard call clear` first",
+    (Mode.STOPPED, "deactivate"): "the robot is stopped and cannot move: `acsard call clear` first",
 }
 
 
