@@ -100,6 +100,16 @@ def test_damage_costs_the_rest_of_its_frame_and_is_said(tmp_path: Path) -> None:
         assert recording.damage or len(numbers) == len(TAKEN), at
 
 
+def test_a_damaged_length_costs_only_its_frame(tmp_path: Path) -> None:
+    """The second frame seems to have a block that reaches beyond the end of the file."""
+    data = bytearray(write(TAKEN))
+    block = frames_in(bytes(data))[1] + len(MAGIC) + 2
+    data[block : block + 3] = (131_000 << 3 | 2 << 1).to_bytes(3, "little")
+    numbers, recording = read(tmp_path / "a", bytes(data))
+    assert numbers == [n for n in range(len(TAKEN)) if not 2 * SECOND <= n < 4 * SECOND]
+    assert len(recording.damage) == 1
+
+
 def test_a_file_that_is_no_recording_is_refused_in_words(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "pipe")
     for path in (tmp_path / "missing", tmp_path, tmp_path / "pipe"):

@@ -8,8 +8,11 @@ from __future__ import annotations
 
 import asyncio
 import binascii
+import fcntl
 import os
 import re
+import termios
+import time
 from itertools import pairwise, permutations
 from typing import Any, get_args
 
@@ -268,12 +271,22 @@ def test_a_line_is_answered_at_its_virtual_time_and_garbled_at_a_wrong_baud_rate
         wire.send(ZERO)
 
 
+def waiting(handle: int) -> int:
+    """Return the number of bytes that can be read."""
+    count = bytearray(4)
+    fcntl.ioctl(handle, termios.FIONREAD, count)
+    return int.from_bytes(count, "little")
+
+
 def test_a_simulator_that_stalled_obeys_the_newest_lines_only() -> None:
     async def stalls(count: int) -> FakeMcu:
         with SimPty(FakeMcu(Config(), clock.mono_ns())) as simulator:
             host = os.open(simulator.path, os.O_WRONLY | os.O_NOCTTY)
             for number in range(count):
                 os.write(host, ZERO.replace(b"ap00", b"ap%02d" % number))
+            # The kernel hands them over in pieces.
+            while waiting(simulator._end.fileno()) < count * len(ZERO):
+                time.sleep(0.001)
             while len(simulator.mcu.heard) < min(count, 7):
                 await asyncio.sleep(0.01)
             os.close(host)
