@@ -57,7 +57,8 @@ def main(args: argparse.Namespace) -> int:
             print(plain(table(rows, width), width=width), flush=True)
         if not any(row.here or row.state for row in rows):
             # Over TLS the client's certificate may not be permitted to see any of the named robots.
-            silence = robot.sibling(rows[0].robot_id).whoami().silence if rows else ""
+            tls = rows and robot.where.tls
+            silence = robot.sibling(rows[0].robot_id).whoami().silence if tls else ""
             raise UnreachableError("; ".join(filter(None, (fleet.hint(), silence))))
     lost = [row.robot_id for row in rows if row.robot_id in ids and absence(row)]
     lost_text = f"gone or silent: {', '.join(lost)}" if lost else ""
