@@ -7,7 +7,6 @@ file on a network disk might hang.
 from __future__ import annotations
 
 import os
-import re
 import subprocess
 from collections.abc import Iterator, Sequence
 from itertools import pairwise
@@ -22,10 +21,6 @@ PROC = Path("/proc")
 
 # Of ptys (Documentation/admin-guide/devices.txt); no serial port has one.
 PTY_MAJORS = range(136, 144)
-
-
-# "-Pm" or "-mNAME" on Python's command line. An argument that is not in this word is the next one.
-OPTION_WITH_ARGUMENT = re.compile(r"-[^-cmWX]*(?P<letter>[cmWX])(?P<argument>.*)", re.DOTALL)
 
 
 class Holder(Struct, frozen=True):
@@ -92,7 +87,7 @@ def is_daemon_here(pid: int) -> bool:
     A daemon in another container may have the process id of another subcommand here.
     """
     command = _text(PROC / str(pid) / "cmdline").split("\0")
-    return _executed(command) == "acsard" and "run" in command
+    return _is_acsard(command) and "run" in command
 
 
 def config_of(pid: int) -> Path | None:
@@ -186,7 +181,7 @@ def _holder(process: Path) -> Holder | None:
 def _name(process: Path) -> str:
     # `python -m acsard` and `python /usr/bin/acsard` are "acsard".
     command = _text(process / "cmdline").split("\0")
-    return "acsard" if _executed(command) == "acsard" else _comm(process)
+    return "acsard" if _is_acsard(command) else _comm(process)
 
 
 def _comm(process: Path) -> str:
@@ -200,21 +195,14 @@ def _text(file: Path) -> str:
         return ""
 
 
-def _executed(command: Sequence[str]) -> str:
+def _is_acsard(command: Sequence[str]) -> bool:
     program = Path(command[0]).name
     if not program.startswith(("python", "pypy")):
-        return program
-    words = iter(command[1:])
-    for word in words:
-        option = OPTION_WITH_ARGUMENT.fullmatch(word)
-        # The word "-" stands for a script on standard input.
-        if option is None and (word == "-" or not word.startswith("-")):
-            return Path(word).name
-        if option is not None:
-            argument = option["argument"] or next(words, "")
-            if option["letter"] in "cm":
-                return argument if option["letter"] == "m" else ""
-    return ""
+        return program == "acsard"
+    return any(
+        word.endswith("/acsard") or (word == "acsard" and before[:1] == "-" and before[-1] == "m")
+        for before, word in pairwise(command)
+    )
 
 
 def run_command(words: tuple[str, ...], within_s: float) -> subprocess.CompletedProcess[str]:

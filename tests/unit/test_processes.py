@@ -92,7 +92,6 @@ def test_a_path_that_is_not_a_device_has_no_holder(path: str) -> None:
         (("/usr/bin/python3.13", "/opt/acsard/0.2.0/bin/acsard", "run"), "acsard run"),
         (("python", "-m", "acsard", "run"), "acsard run"),
         (("python3", "-PBm", "acsard"), "acsard"),
-        (("python3", "-X", "utf8", "-Wignore", "-macsard"), "acsard"),
         (("python3", "-P", "-X", "utf8", "bin/acsard", "web"), "acsard"),
         (("screen", "-S", "acsard", "/dev/ttyACM0"), "other"),
         (("tail", "-f", "/dev/null", "/tmp/acsard"), "other"),
