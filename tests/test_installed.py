@@ -17,7 +17,7 @@ from threading import Timer
 import pytest
 
 from acsard.cli import UNLISTED, VERBS
-from acsard.host.version import commit_of
+from acsard.host.version import source_of
 from deploy.release import contents
 from tests.pages import ROOT
 from tests.unit.calibration_logs import usual
@@ -26,7 +26,7 @@ pytestmark = [
     pytest.mark.slow,
     pytest.mark.nightly,
     pytest.mark.timeout(1200),
-    pytest.mark.skipif(not commit_of(ROOT), reason="the wheel is made from a git clone"),
+    pytest.mark.skipif(not source_of(ROOT), reason="the wheel is made from a git clone"),
 ]
 
 WITHIN_S = 60.0

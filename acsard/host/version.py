@@ -50,26 +50,24 @@ def source() -> str:
 
 
 def source_of(clone: Path) -> str:
-    """Return the commit that is checked out in `clone`, with `.dirty` if files differ from it."""
-    commit = commit_of(clone)
-    return commit and commit + (DIRTY if _is_changed(clone) else "")
+    """Return the commit that is checked out in `clone`, with `.dirty` if files differ from it.
 
-
-def commit_of(clone: Path) -> str:
-    """Return the commit that is checked out in `clone`; "" if it is no git clone.
-
-    This reads git's files, because a computer that runs the daemon may have no git.
+    "" if it is no clone, or without git. A clone of another user is read too.
     """
-    git = clone / ".git"
-    if git.is_file():  # the directory is a worktree
-        git = clone / _text(git).removeprefix("gitdir:").strip()
-    head = _text(git / "HEAD")
-    if not head.startswith("ref: "):
-        return head
-    name = head.removeprefix("ref: ")
-    common = git / (_text(git / "commondir") or ".")
-    packed = [line.partition(" ") for line in _text(common / "packed-refs").splitlines()]
-    return _text(common / name) or next((commit for commit, _, ref in packed if ref == name), "")
+    if not (clone / ".git").exists():
+        return ""  # git would look in the directories above
+    git = ["git", "--no-optional-locks", "-c", "safe.directory=*", "-C", str(clone)]
+    try:
+        done = subprocess.run(
+            [*git, "status", "--porcelain=v2", "--branch"],
+            stdin=subprocess.DEVNULL, capture_output=True, text=True, timeout=GIT_TIMEOUT_S,
+            check=True,
+        )  # fmt: skip
+    except (OSError, subprocess.SubprocessError):
+        return ""
+    lines = done.stdout.splitlines()
+    commit = lines[0].removeprefix("# branch.oid ")
+    return commit + DIRTY if any(line[0] != "#" for line in lines) else commit
 
 
 def order(version: str) -> tuple[int, ...]:
@@ -82,19 +80,6 @@ def order(version: str) -> tuple[int, ...]:
         return ()
     major, minor, patch, phase, step = match.groups()
     return int(major), int(minor), int(patch), _PHASES.index(phase), int(step or 0)
-
-
-def _is_changed(clone: Path) -> bool:
-    # Without git, the source counts as unchanged. A clone of another user is read too.
-    git = ["git", "--no-optional-locks", "-c", "safe.directory=*", "-C", str(clone)]
-    try:
-        done = subprocess.run(
-            [*git, "status", "--porcelain"],
-            stdin=subprocess.DEVNULL, capture_output=True, timeout=GIT_TIMEOUT_S, check=False,
-        )  # fmt: skip
-    except (OSError, subprocess.SubprocessError):
-        return False
-    return bool(done.stdout)
 
 
 def _text(path: Path) -> str:

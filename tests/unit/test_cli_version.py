@@ -23,7 +23,7 @@ from acsard.host import extras
 from acsard.host.extras import Extra, install
 from acsard.host.logs import Log
 from acsard.host.terminal_modes import single_key_mode
-from acsard.host.version import commit_of, full_version, order, source_of
+from acsard.host.version import full_version, order, source_of
 from tests.each import each
 
 
@@ -51,24 +51,26 @@ def test_the_commit_equals_that_of_git_in_each_layout_of_a_clone(clone: Path) ->
         ["checkout", "--detach"],
     ):
         git(clone, *words)
-        assert commit_of(clone) == git(clone, "rev-parse", "HEAD")
+        assert source_of(clone) == git(clone, "rev-parse", "HEAD")
     git(clone, "worktree", "add", "-q", "-b", "other", "../tree")
     tree = clone.parent / "tree"
     git(tree, "commit", "-q", "--allow-empty", "-m", "second")
-    assert commit_of(tree) == git(tree, "rev-parse", "HEAD") != commit_of(clone)
+    (tree / "below").mkdir()
+    assert source_of(tree / "below") == "", "installed in a clone of another program"
+    assert source_of(tree) == git(tree, "rev-parse", "HEAD") != source_of(clone)
 
 
 def test_a_changed_clone_is_dirty_and_an_ignored_file_changes_nothing(
     clone: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    commit = commit_of(clone)
+    commit = source_of(clone)
     (clone / ".git/info/exclude").write_text("ignored\n")
     (clone / "ignored").touch()
     assert source_of(clone) == commit
     (clone / "new").touch()
     assert source_of(clone) == f"{commit}.dirty"
     monkeypatch.setenv("PATH", "")
-    assert source_of(clone) == commit, "without git, the commit is still known"
+    assert source_of(clone) == "", "without git"
 
 
 COMMIT = "1a2b3c4d5" + "0" * 31
