@@ -14,7 +14,6 @@ from collections import deque
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from functools import partial
-from typing import Any
 
 import msgspec
 import zenoh
@@ -24,11 +23,12 @@ from acsard.bus.address import Address
 from acsard.bus.tls_files import shown_at
 from acsard.client.connection import Connection
 from acsard.client.follower import UNREADABLE, Watch, restarted
-from acsard.core.config.settings import RatesConfig
-from acsard.core.messages.encodings import DecodeError
+from acsard.core.config.parsing import from_builtins
+from acsard.core.config.settings import Config
 from acsard.core.messages.schema import Info, RobotState
+from acsard.core.values import AcsardError
 from acsard.host import clock
-from acsard.host.errors import MendableError, UnreachableError
+from acsard.host.errors import UnreachableError
 from acsard.host.threads import NoThreadError, Worker, in_thread
 from acsard.web.metrics import Counts
 from acsard.web.streams import Streams
@@ -61,6 +61,18 @@ class About(Struct, frozen=True):
     state_hz: float
     recordings: str  # directory on the daemon's machine; "" if it records nothing
     timeouts: Mapping[str, float]  # of the command sources, s
+
+    @classmethod
+    def of(cls, version: str, simulated: bool, config: Config) -> About:
+        return cls(
+            version,
+            simulated,
+            config.limits.linear_speed,
+            config.limits.angular_speed,
+            config.rates.state_hz,
+            config.record.directory,
+            {source.name: source.timeout for source in config.commands.sources},
+        )
 
 
 class PathHistory:
@@ -174,21 +186,7 @@ class FollowedRobot:
     def _query_about(self, client: Connection) -> None:
         try:
             info: Info = client.get("info")
-            config: dict[str, Any] = client.get("config")
-            self.about = About(
-                info.version,
-                info.simulated,
-                float(config["limits"]["linear_speed"]),
-                float(config["limits"]["angular_speed"]),
-                RatesConfig(telemetry=float(config["rates"]["telemetry"])).state_hz,
-                str(config["record"]["directory"]),
-                {
-                    str(source["name"]): float(source["timeout"])
-                    for source in config["commands"]["sources"]
-                },
-            )
-        except (
-            MendableError, DecodeError, msgspec.MsgspecError, zenoh.ZError, KeyError, TypeError,
-            ValueError,
-        ):  # fmt: skip
+            config = from_builtins(client.get("config"))
+            self.about = About.of(info.version, info.simulated, config)
+        except (AcsardError, msgspec.MsgspecError, zenoh.ZError):
             self._about_due_s = clock.steady_s() + ABOUT_RETRY_S

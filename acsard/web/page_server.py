@@ -77,9 +77,8 @@ async def serve(
         require_certificate(options.listen, options.tls)
         certificate = Certificate(options.tls, log)
     names = set[str]() if certificate is None else certificate.names
-    robot = FollowedRobot(
-        options.address, lambda: _connected(options.address), _about(options), counts
-    )
+    about = About.of("", options.config.mcu.simulated, options.config)
+    robot = FollowedRobot(options.address, lambda: _connected(options.address), about, counts)
     parts = Parts(robot, counts)
     tokens = ReadTokens(Vault(options.state, options.address.robot_id))
     connections = Connections(counts)
@@ -163,19 +162,6 @@ async def _watch_parent(leaving: asyncio.Event) -> None:
 def _connected(address: Address) -> Connection:
     session = client_session(address.endpoint, address.tls)
     return Connection(session, address.robot_id, DEFAULT_SOURCE, address.tls, address.endpoint)
-
-
-def _about(options: ServerOptions) -> About:
-    config = options.config
-    return About(
-        "",
-        config.mcu.simulated,
-        config.limits.linear_speed,
-        config.limits.angular_speed,
-        config.rates.state_hz,
-        "",
-        {source.name: source.timeout for source in config.commands.sources},
-    )
 
 
 class Certificate:

@@ -107,8 +107,8 @@ def _checked(table: object) -> Config:
 
 
 def from_builtins(data: object) -> Config:
-    """Convert the result of `effective` back to a `Config`."""
-    return convert(data, Config)
+    """Convert the result of `effective`, in a daemon of any version, back to a `Config`."""
+    return convert(known_part(Config, data), Config)
 
 
 def effective(config: Config) -> dict[str, object]:
