@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import atexit
 import os
-import platform
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -202,7 +201,7 @@ class Connection(Reads):
         # The secret identifies this program as a caller of services. Clients made by `sibling`
         # share it, although they may send commands under another name.
         self._secret = new_secret()
-        whole = sender_id(f"{platform.node()[:32]}/{os.getpid()}")
+        whole = sender_id(self.name)
         self._sender, self._sender_id = CommandSigner(whole), whole
         self._beats = Beats(session, self.key(BEAT))
         self._own_causes: set[int] = set()  # that calls of this client have latched

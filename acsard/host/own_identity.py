@@ -12,15 +12,19 @@ from acsard.core.messages.signature import MAX_NAME_LENGTH
 
 
 def own_name() -> str:
-    """Return the name of this process: user, machine and program, like "alice@laptop patrol"."""
+    """Return the name of this process: user, machine and program, like "alice@laptop patrol".
+
+    A subcommand of acsard is part of it: "alice@laptop acsard calibrate".
+    """
     try:
         user = pwd.getpwuid(os.getuid()).pw_name
     except KeyError:
         user = str(os.getuid())
     machine = os.uname().nodename.partition(".")[0]
     path = Path(sys.argv[0])
-    program = path.parent.name if path.stem == "__main__" else path.stem
-    return f"{user}@{machine} {program.removeprefix('-c')}".rstrip()
+    program = path.parent.name if path.stem == "__main__" else path.stem.removeprefix("-c")
+    words = [program, *sys.argv[1:2]] if program == "acsard" else [program]
+    return " ".join([f"{user}@{machine}", *words]).rstrip()
 
 
 def sender_id(name: str, secret: str = "") -> str:

@@ -42,7 +42,7 @@ def test_the_log_names_the_client_of_each_call_by_its_own_name(shared: Daemon, b
     assert me in own_name()
     assert re.fullmatch(rf"{re.escape(own_name())}/[0-9a-f]{{16}} \(native\)", pose)
     assert re.fullmatch(r"patrol \?\?2J\?native\?/[0-9a-f]{16} \(native\)", stop)
-    assert re.search(rf"{me} acsard/[0-9a-f]{{16}} \(native\)$", clear)
+    assert re.search(rf"{me} acsard call/[0-9a-f]{{16}} \(native\)$", clear)
     assert by(shared, "deactivate") == ["unnamed (native)"]
 
 

@@ -47,7 +47,7 @@ def test_a_finger_drives_turns_and_stops_and_releases_the_stop(phone: Phone) -> 
     phone.hold()
     browser.tap("stop")
     until(lambda: bus.state()["mode"] == "stopped", 5.0, "it stops")
-    phone.shows("reason", "stopped by here@page")
+    phone.shows("reason", "stopped by your page")
     browser.touch("End")
     browser.release()
     phone.shows("mode", "READY")

@@ -65,6 +65,10 @@ def values(scripts: Path) -> dict[str, Any]:
 
 
 OTHER = "'here/fedcba9876543210'"
+PRESSED = (
+    "{ kind: 'stop', stamp: { sec: 1, nanosec: 0 }, by: 'here@page/0123456789abcdef (native)', "
+    "text: 'stopped by here@page/0123456789abcdef (native)' }"
+)
 
 FACTS: list[tuple[str, Any]] = [
     # Numbers and times.
@@ -91,6 +95,9 @@ FACTS: list[tuple[str, Any]] = [
     ("words.person('unnamed')", "a program without a name"),
     ("words.person('session 0123456789abcdef [laptop]')", "laptop"),
     ("words.person('0b5d (rmw)')", "0b5d (rmw)"),
+    ("words.person('tv@page/0123456789abcdef', 'phone/fedcba9876543210')", "the page of tv"),
+    (f"words.reason({{ mode: 'stopped', causes: [{PRESSED}] }}, {OTHER}).split(' · ')[0]",
+     "stopped by your page"),
     # Why a push would not move the robot.
     ("still(null, 'teleop', 'me')", "Nothing is received from the robot."),
     ("still(ready, 'teleop', 'me')", ""),

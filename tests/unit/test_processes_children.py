@@ -218,8 +218,8 @@ def test_a_stall_of_the_machine_does_not_count_as_silence(stalls: list[int]) -> 
     ("program", "suffix"),
     [
         ("/home/joe/patrol.py", " patrol"),
-        ("/opt/venv/bin/acsard", " acsard"),
-        ("/opt/lib/acsard/__main__.py", " acsard"),
+        ("/opt/venv/bin/acsard", " acsard call"),
+        ("/opt/lib/acsard/__main__.py", " acsard call"),
         ("-c", ""),
         ("", ""),
     ],
@@ -227,7 +227,7 @@ def test_a_stall_of_the_machine_does_not_count_as_silence(stalls: list[int]) -> 
 def test_the_own_name_has_user_machine_and_program(
     monkeypatch: pytest.MonkeyPatch, program: str, suffix: str
 ) -> None:
-    monkeypatch.setattr(sys, "argv", [program])
+    monkeypatch.setattr(sys, "argv", [program, "call", "stop"])
     user, machine = pwd.getpwuid(os.getuid()).pw_name, os.uname().nodename.partition(".")[0]
     assert own_name() == f"{user}@{machine}{suffix}"
 

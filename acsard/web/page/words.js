@@ -68,7 +68,9 @@ export function person(sender, own = "") {
   if (own && sender === own) return "you";
   if (name === "unnamed") return NAMELESS;
   if (name === "here") return "another page on the robot itself";
-  if (name && own && name === own.replace(/\/[^/]*$/, "")) return `another page of ${name}`;
+  const ours = own.replace(/\/[^/]*$/, "");
+  if (name && name === ours) return `another page of ${name}`;
+  if (name?.endsWith("@page")) return name === `${ours}@page` ? "your page" : `the page of ${name.slice(0, -5)}`;
   return name || certificate || NAMELESS;
 }
 
@@ -78,5 +80,6 @@ export function reason(state, own) {
   if (state.code === "no_command") return "Nobody drives.";
   if (!RELEASE[state.mode]) return state.reason;
   const causes = state.causes.filter(({ kind }) => (kind === "inactive") === (state.mode === "inactive"));
-  return causes.map(({ text, stamp }) => `${text} · ${clock(stamp, new Date())}`).join("; also ") || state.reason;
+  const words = ({ text, by }) => (by ? text.replace(by, () => person(by.replace(/ \(native\)$/, ""), own)) : text);
+  return causes.map((cause) => `${words(cause)} · ${clock(cause.stamp, new Date())}`).join("; also ") || state.reason;
 }
