@@ -16,7 +16,7 @@ from msgspec import Struct
 from msgspec.structs import replace
 
 from acsard.bus.zenoh_sessions import client_session
-from acsard.calibration.drive import Recorder
+from acsard.calibration.leg import Recorder
 from acsard.calibration.log import Floats, Log, LogError, Run, TapeReading
 from acsard.calibration.plan import METHODS, WHEELBASE, Leg, Setup, legs
 from acsard.client.connection import Connection

@@ -22,14 +22,20 @@ from acsard.checkup import (
     outcomes,
     restarts,
     watchdog,
-    wheels,
 )
 from acsard.checkup.board import Board, Operator, Wire
+from acsard.checkup.channels import (
+    Channel,
+    ask_which_wheel,
+    channel,
+    encoder_finding,
+    stands,
+    wheel_map,
+)
 from acsard.checkup.findings import SKIPPED_STEPS, Finding, StoppedError, WireLostError, motor_name
 from acsard.checkup.motion import SHORT_MEASUREMENT_S
 from acsard.checkup.outcomes import TimingFinding
 from acsard.checkup.restarts import Restart, RestartedError
-from acsard.checkup.wheels import Channel, encoder_finding, wheel_map
 from acsard.core.config.settings import Config, SafetyConfig
 from acsard.core.formatting import many
 from acsard.core.link.link_state import WATCHDOG_S
@@ -208,7 +214,7 @@ class _Steps:
         try:
             for motor in range(4):
                 self._take("", partial(self._turn, motor), still.append)
-                while still and not all(map(wheels.stands, self._channels)):
+                while still and not all(map(stands, self._channels)):
                     self._tell(still.pop(0))
             if still:
                 still = [outcomes.find("motors: still")]
@@ -221,14 +227,14 @@ class _Steps:
         operator.doing(f"{motor_name(board.mcu, motor)} turns: briefly, then forward and back")
 
         def measure_motor() -> Finding:
-            channels[motor:] = [wheels.channel(board, motor)]
+            channels[motor:] = [channel(board, motor)]
             return encoder_finding(board.mcu, channels[motor])
 
         finding = self._in_time(measure_motor)
         if finding is not None and not lateness.judged(finding):
             channels[motor] = structs.replace(channels[motor], judged=False)
             return finding
-        channels[motor] = wheels.ask_which_wheel(board, operator, channels[motor])
+        channels[motor] = ask_which_wheel(board, operator, channels[motor])
         return encoder_finding(board.mcu, channels[motor])
 
     def _measure(self, doing: str, step: Step) -> None:

@@ -13,7 +13,7 @@ import pytest
 import zenoh
 
 from acsard.bus.zenoh_sessions import client_session
-from acsard.calibration.drive import Sensor, place_and_yaw
+from acsard.calibration.leg import Sensor, place_and_yaw
 from acsard.core.messages.encodings import FORMATS, encode
 from acsard.core.messages.schema import Odometry, PoseStamped
 from tests.system.bystander import lost

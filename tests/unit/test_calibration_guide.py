@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from msgspec.structs import replace
 
-from acsard.calibration.drive import require_path
 from acsard.calibration.fit import Base
 from acsard.calibration.guide import MAX_REPEATS, guided
+from acsard.calibration.leg import require_path
 from acsard.calibration.log import Floats, Log, LogError, Notes, Run, run_of
 from acsard.calibration.plan import FLOOR_M, METHODS, Leg, Move, Setup, legs
 from acsard.calibration.result import calibrate

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import pytest
 
+from acsard.checkup.channels import turn
 from acsard.checkup.findings import StoppedError
 from acsard.checkup.motion import MOTOR_TIMEOUT_S, SPEED, ZERO
 from acsard.checkup.watchdog import run
-from acsard.checkup.wheels import turn
 from acsard.core.simulator import protocol
 from tests.unit.checkup_robots import Robot
 

@@ -7,9 +7,9 @@ import math
 import pytest
 from msgspec import structs
 
-from acsard.checkup import motion, wheels
+from acsard.checkup import motion
+from acsard.checkup.channels import Channel, Kind, encoder_finding, probe
 from acsard.checkup.motion import SHORT_MEASUREMENT_S, BoardReply
-from acsard.checkup.wheels import Channel, Kind, encoder_finding
 from acsard.core.config.settings import Config, McuConfig, SimConfig
 from acsard.core.link.checked_line import Reading
 from acsard.core.link.codec import Motors
@@ -92,12 +92,12 @@ def test_a_probe_is_short_and_commands_a_dead_motor_at_most_3_rad_s() -> None:
     robot = Robot("plain_only", "dead_motor=b")
     with robot.board() as board:
         began, before = robot.now_ns(), len(robot.sent)
-        assert wheels.probe(board, 1) == (0.0, 0.0, 0.0, 0.0)
+        assert probe(board, 1) == (0.0, 0.0, 0.0, 0.0)
         lines = [line for line in robot.sent[before:] if b"bp00.00" not in line]
         assert {line[8:15] for line in lines} == {b"bp01.50", b"bp03.00"}
         assert len(lines) <= 2 * (SHORT_MEASUREMENT_S / board.period_s + 1)
         assert robot.now_ns() - began < 3e9
-        assert wheels.probe(board, 0) is None
+        assert probe(board, 0) is None
 
 
 @pytest.mark.parametrize("per_turn", [16, 24, 48, 3200])
@@ -109,7 +109,7 @@ def test_a_probe_distinguishes_a_motor_that_follows_from_a_reversed_encoder(
     for fault, follows in ((), True), (("reversed_encoder=c",), False):
         robot = Robot("plain_only", *fault, config=config)
         with robot.board() as board:
-            speeds = wheels.probe(board, 2)
+            speeds = probe(board, 2)
             assert (speeds is None) is follows
             if speeds is not None:
                 channel = Channel(2, speeds, (0.0, 0.0, 0.0, 0.0), probed=True)
