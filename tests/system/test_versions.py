@@ -27,7 +27,10 @@ from tests.system.harness import (
 )
 
 OTHER = "49de831f95b56680c26f11023fd41d6efcc65726"
-"""An earlier commit than 0.2.0. It has no `release_port`, and its robot has other parts."""
+"""A commit before 0.2.0, because nothing has been released yet.
+
+It has no `release_port`, and its robot has other parts, so it differs more than 0.2.0's last builds.
+"""
 
 
 def _has_other() -> bool:
