@@ -29,7 +29,8 @@ from tests.system.harness import (
 OTHER = "49de831f95b56680c26f11023fd41d6efcc65726"
 """A commit before 0.2.0, because nothing has been released yet.
 
-It has no `release_port`, and its robot has other parts, so it differs more than 0.2.0's last builds.
+It has no `release_port`, and its robot has other parts, so it differs
+more than the last builds before 0.2.0.
 """
 
 

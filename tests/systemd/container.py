@@ -20,8 +20,8 @@ from typing import Any, NamedTuple, NoReturn
 
 import pytest
 
-from tests.system.harness import ROOT, FarPeer, Program, until
-from tests.systemd.image import OURS, SUITES, UnavailableError, cgroups
+from tests.system.harness import FAR, ROOT, FarPeer, Program, until
+from tests.systemd.image import OURS, SUITES, cgroups
 
 UNIT, GATEWAY, PAGE = "acsard.service", "acsard-gateway.service", "acsard-web.service"
 
@@ -69,7 +69,10 @@ class Ran(NamedTuple):
 
 
 class Container:
-    """A booted systemd. The end of the `with` ends it and all its processes."""
+    """A booted systemd. The end of the `with` ends it and all its processes.
+
+    If this machine cannot boot it, the test is skipped, or fails in CI.
+    """
 
     def __init__(
         self, rootfs: Path, scratch: Path, name: str = "acsard-test", keeps: Path | None = None
@@ -87,7 +90,7 @@ class Container:
         try:
             self._cgroup.mkdir()
         except OSError as error:
-            raise UnavailableError(f"no cgroup of our own: {error}") from error
+            unavailable(f"no cgroup of our own: {error}")
         procs = self._cgroup / "cgroup.procs"
         words = ["sh", "-c", 'echo $$ > "$0" && exec "$@"', str(procs), "systemd-nspawn"]
         words += ["--quiet", "--boot", "--register=no", "--keep-unit", "--private-network"]
@@ -114,7 +117,7 @@ class Container:
         except AssertionError as error:
             self.__exit__()
             console = self._log.read_text(errors="replace")[-500:]
-            raise UnavailableError(f"{error}: {console}") from error
+            unavailable(f"{error}: {console}")
         # Before this, systemd mistakes the container's cgroup for the host's.
         self.run("systemctl", "daemon-reexec")
         return self
@@ -263,6 +266,10 @@ class Container:
             return 0.0  # the kernel does not count it
         return int(some.rpartition("total=")[2]) / 1e6
 
+    def fetch(self, path: str, *post: str) -> str:
+        """Return the page's answer to a client in the container. With `post` it is a POST."""
+        return self.run("python3", "-c", _FETCH, f"http://127.0.0.1:8080{path}", *post).out
+
     def journal(self) -> list[dict[str, Any]]:
         """Return the log of the unit's current or last run."""
         self.run("journalctl", "--sync")
@@ -283,58 +290,27 @@ class Container:
         )
 
 
-# Forget the exclusive lock when no program has the port open any more, as a real port does. The
-# terminal of a pty lives on with its other end.
-_BOARD = """\
-import fcntl, grp, os, pty, select, sys, termios, time, tty
-os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(50))
-master, slave = pty.openpty()
-name = os.ttyname(slave)
-tty.setraw(slave)
-os.chown(slave, 0, grp.getgrnam("dialout").gr_gid)
-os.chmod(slave, 0o660)
-os.close(slave)
-os.symlink(name, sys.argv[1])
-print("plugged", flush=True)
-held = turning = told = b""
-while True:
-    try:
-        data = os.read(master, 4096)
-    except OSError:
-        slave = os.open(name, os.O_RDWR | os.O_NOCTTY)
-        fcntl.ioctl(slave, termios.TIOCNXCL)
-        os.close(slave)
-        time.sleep(0.001)
-        continue
-    now = time.monotonic()
-    *lines, held = (held + data).split(b"\\n")
-    for line in lines:
-        if line.startswith(b"a"):
-            lies = os.path.exists(sys.argv[2])
-            # Replies that equal the lines would be an echo: wheel a turns a little otherwise.
-            says = turning or line
-            if says.strip(b"abcdpn0.,\\r"):
-                says = says[:6] + (b"1" if says[6:7] == b"0" else b"0") + says[7:]
-            if lies:
-                says = b"ap99.00,bp99.00,cp99.00,dp99.00\\r"
-            turning, told = told, line
-            os.write(master, says + b"\\n")
-        print(repr(now), line.decode(errors="replace").strip("? \\r") or "-", flush=True)
+# The container has no curl.
+_FETCH = """\
+import sys
+from urllib.error import HTTPError
+from urllib.request import Request, urlopen
+
+try:
+    answer = urlopen(Request(sys.argv[1], *(b"" for _ in sys.argv[2:])))
+except HTTPError as refused:
+    answer = refused
+print(answer.read().decode())
 """
 
 
 class Board(FarPeer):
-    """A simulated serial board in the container, in a process with precedence over all others.
-
-    Its timestamps are therefore reliable. It answers each command with the speeds requested two
-    lines before; only wheel a is 0.01 to 0.09 off. It reports wrong speeds while the file `LIES`
-    exists.
-    """
+    """A simulated board at the container's serial port. It lies while the file `LIES` exists."""
 
     def __init__(self, container: Container) -> None:
         self._heard = []
         container.path(PORT).unlink(missing_ok=True)
-        words = container.inside("python3", "-c", _BOARD, PORT, LIES, only="mnC")
+        words = container.inside("python3", "-c", FAR, PORT, LIES, only="mnC")
         Program.__init__(self, words, "/")
 
 

@@ -11,8 +11,7 @@ from contextlib import suppress
 import aiohttp
 
 from tests.system.hosts import inside, ip
-from tests.systemd.container import Container
-from tests.systemd.image import UnavailableError
+from tests.systemd.container import Container, unavailable
 
 ROBOT_AT, PHONE_AT = "192.168.77.1", "192.168.77.2"
 """An address on a network that `lan.conf` names."""
@@ -44,7 +43,7 @@ class Phone:
             ip("-n", self.name, "link", "set", "cable", "up")
         except subprocess.CalledProcessError as error:
             self.__exit__()
-            raise UnavailableError(f"no network namespace: {error.stderr.decode()}") from error
+            unavailable(f"no network namespace: {error.stderr.decode()}")
         for at in (ROBOT_AT, STRANGE):
             self._container.types(f"ip address add {at}/24 dev cable")
         self._container.types("ip link set cable up")

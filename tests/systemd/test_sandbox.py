@@ -15,7 +15,6 @@ from tests.systemd.container import (
     ACSARD,
     CONFIG,
     GATEWAY,
-    HOME,
     PAGE,
     PORT,
     UNIT,
@@ -46,37 +45,6 @@ def test_systemd_finds_nothing_wrong_with_the_units_and_their_drop_ins(
         text = container.run("systemd-analyze", *words).out.splitlines()[-1]
         print(text.strip(" →"))
         assert float(text.partition(f"{unit}:")[2].split()[0]) <= EXPOSURE
-
-
-def test_the_unit_of_a_fleet_s_router_runs_the_router(container: Container) -> None:
-    unit, place = "acsard-router.service", ("127.0.0.1", 7460)
-    file = f"/etc/systemd/system/{unit}"
-    router = {
-        "mode": "router",
-        "listen": {"endpoints": [f"tcp/{place[0]}:{place[1]}"]},
-        "scouting": {"multicast": {"enabled": False}},
-    }
-    assert container.run("useradd", "--system", "zenohd").code == 0
-    try:
-        container.write(file, (ROOT / "deploy/zenoh" / unit).read_text())
-        container.write("/etc/zenohd/router.json5", json.dumps(router))
-        checked = container.run("systemd-analyze", "verify", file)
-        assert (checked.code, checked.out, checked.err) == (0, "", "")
-        assert container.run("systemctl", "daemon-reload").code == 0
-        assert container.start(unit).code == 0
-        connect = f"import socket; socket.create_connection({place}, 1.0)"
-        words = (f"{HOME}/venv/bin/python", "-c", connect)
-        until(lambda: container.run(*words).code == 0, 10.0, "the router listens")
-        assert (container.show("ActiveState", unit), container.show("User", unit)) == (
-            "active",
-            "zenohd",
-        )
-    finally:
-        print(container.messages(unit))
-        container.run("systemctl", "stop", unit)
-        container.run("rm", "-r", file, "/etc/zenohd")
-        container.run("systemctl", "daemon-reload")
-        container.run("userdel", "zenohd")
 
 
 def opened(container: Container) -> None:

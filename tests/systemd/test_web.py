@@ -20,9 +20,7 @@ from tests.systemd.container import (
     PAGE,
     UNIT,
     Container,
-    unavailable,
 )
-from tests.systemd.image import UnavailableError
 from tests.systemd.phone import ROBOT_AT, STRANGE, Phone
 
 pytestmark = pytest.mark.systemd
@@ -53,14 +51,6 @@ REVOKING, RENEWING = of_the_page("console", "tls renew").commands()
 SETTINGS = 'mcu.port = "sim"\n' + of_the_page("toml", "https://0.0.0.0:8443").text
 
 
-ASK = """\
-import sys
-from urllib.request import urlopen
-
-print(urlopen(sys.argv[1]).read().decode())
-"""
-
-
 def clean(container: Container) -> None:
     """Remove certificates and tokens, so that the container is as it was after the installation."""
     container.reset()
@@ -83,26 +73,18 @@ def robot(booted: Container) -> Iterator[Container]:
 @pytest.fixture(scope="module")
 def phone(robot: Container) -> Iterator[Phone]:
     """Provide a phone, after the robot's page was opened to the network."""
-    try:
-        with Phone(robot) as phone:
-            robot.write(CONFIG, SETTINGS)
-            for command in OPENING[:-1]:
-                robot.types(command)
-            is_served(robot, phone)
-            yield phone
-    except UnavailableError as why:
-        unavailable(why)
+    with Phone(robot) as phone:
+        robot.write(CONFIG, SETTINGS)
+        for command in OPENING[:-1]:
+            robot.types(command)
+        is_served(robot, phone)
+        yield phone
 
 
 def is_served(robot: Container, phone: Phone) -> None:
     """Check that both the page and the daemon behind it answer the phone."""
     until(lambda: phone.presented_certificate(8443), SERVED_S, "the page is served")
-    until(lambda: '"mode"' in fetch_on_robot(robot, "/api/state"), SERVED_S, "it hears the robot")
-
-
-def fetch_on_robot(robot: Container, path: str) -> str:
-    """Return the page's answer to a client on the robot itself, or "" if there is none."""
-    return robot.run("python3", "-c", ASK, f"http://127.0.0.1:8080{path}").out
+    until(lambda: '"mode"' in robot.fetch("/api/state"), SERVED_S, "it hears the robot")
 
 
 def invited(robot: Container, *more: str) -> str:
@@ -167,7 +149,7 @@ def test_an_invited_phone_drives_and_stops_the_installed_robot_until_it_is_revok
 
     on(phone, story)
     stands = until(
-        lambda: (state := json.loads(fetch_on_robot(robot, "/api/state")))["linear"] == 0 and state,
+        lambda: (state := json.loads(robot.fetch("/api/state")))["linear"] == 0 and state,
         SERVED_S,
         "the robot stands",
     )
