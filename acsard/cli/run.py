@@ -39,7 +39,7 @@ acsard {version}, robot {robot}
     acsard call stop{reach}  stop it, and keep it stopped until `acsard call clear`
 """
 
-_PAGE = "  page    {where}, for a browser; a line below says when the page is ready\n"
+_PAGE = '  page    {where}, for a browser, when "page ready" stands below\n'
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:

@@ -119,9 +119,9 @@ def places(
         note = "" if address == wished else instead
         for url in page_urls(address, tls):
             first = first or url
-            yield f"page    {url}{note}"
+            yield f"page ready  {url}{note}"
     if with_manual:
-        yield f"manual  {first}docs"
+        yield f"manual      {first}docs"
 
 
 def main(args: argparse.Namespace) -> int:

@@ -226,7 +226,7 @@ def test_a_daemon_in_a_terminal_serves_its_page_at_a_free_port_and_restarts_it(
         with Terminal(tmp_path, "--config", str(config), "--record", "box") as daemon:
             daemon.shows(rf"page +http://127.0.0.1:{port}, for a browser")
             url = daemon.shows(
-                rf"page +(http://127.0.0.1:\d+/) +\(instead of http://127.0.0.1:{port}/, at which"
+                rf"ready +(http://127.0.0.1:\d+/) +\(instead of http://127.0.0.1:{port}/, at which"
             )[1]
             assert json.loads(asyncio.run(text(f"{url}api/whoami")))["role"] == "maintainer"
 
@@ -251,7 +251,9 @@ def test_a_daemon_in_a_terminal_serves_its_page_at_a_free_port_and_restarts_it(
             daemon.shows("page ended with exit code 78; it is restarted")
             daemon.seen = ""
             config.write_text(valid)
-            daemon.shows(rf"page +http://127.0.0.1:\d+/ +\(instead of http://127.0.0.1:{port}/")
+            daemon.shows(
+                rf"page ready +http://127.0.0.1:\d+/ +\(instead of http://127.0.0.1:{port}/"
+            )
             (third,) = daemon.page()
             daemon.signal(signal.SIGKILL)
             until(lambda: not Path(f"/proc/{third}").exists(), START_S, "the page ends too")
@@ -273,7 +275,7 @@ def test_the_page_starts_answers_and_stays_alive_while_nobody_reads_the_terminal
         return ""
 
     with Terminal(tmp_path, "--config", str(config)) as daemon:
-        daemon.shows(rf"page +{url}/")
+        daemon.shows(rf"page ready +{url}/")
         (first,) = daemon.page()
         termios.tcflow(daemon.slave, termios.TCOOFF)
         try:
@@ -291,7 +293,7 @@ def test_the_page_starts_answers_and_stays_alive_while_nobody_reads_the_terminal
         finally:
             termios.tcflow(daemon.slave, termios.TCOON)
         daemon.seen = ""
-        daemon.shows(rf"page +{url}/")
+        daemon.shows(rf"page ready +{url}/")
 
 
 @pytest.mark.slow

@@ -82,11 +82,11 @@ def test_an_invitation_has_the_certified_addresses_at_which_the_server_listens(
 def test_the_lines_at_the_start_name_each_page_and_the_manual_that_it_serves() -> None:
     wished, other = Listen(False, "127.0.0.1", 8080), Listen(False, "127.0.0.1", 8081)
     assert list(web.places([wished], [wished], "", with_manual=False)) == [
-        "page    http://127.0.0.1:8080/"
+        "page ready  http://127.0.0.1:8080/"
     ]
     page, manual = web.places([other], [wished], "", with_manual=True)
-    assert page.startswith("page    http://127.0.0.1:8081/  (instead of http://127.0.0.1:8080/")
-    assert manual == "manual  http://127.0.0.1:8081/docs"
+    assert page.startswith("page ready  http://127.0.0.1:8081/  (instead of http://127.0.0.1:8080/")
+    assert manual == "manual      http://127.0.0.1:8081/docs"
 
 
 @pytest.mark.parametrize(("host", "by"), [("0.0.0.0", {"127.0.0.1"}), ("::", {"127.0.0.1", "::1"})])
