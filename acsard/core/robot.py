@@ -85,8 +85,8 @@ UNLATCHED = (Mode.DRIVING, Mode.READY)  # their reason depends only on the choic
 QUIET = News()
 
 PORT_LENT = (
-    "the serial port is closed; type `acsard call activate` to open it again. The pose is unknown "
-    "until `acsard call reset_odometry` or `acsard call set_pose`"
+    "the serial port is closed; type `acsard call activate` to open it again. The pose is then "
+    "unknown until `acsard call reset_odometry` or `acsard call set_pose`"
 )
 
 NOTHING_CHANGED = "nothing changed: all settings already have these values"
@@ -526,7 +526,9 @@ class Robot:
                     self._arbiter.require_neutral(asked_ns)
                 return message, numbers
             case "activate":
-                life.port_released = False  # even if it is refused
+                if life.port_released:
+                    life.port_released = False  # even if it is refused
+                    self._odometry.uncertainty.lose()
                 numbers = life.activate(request.numbers, asked_ns)
                 self._arbiter.forget_clocks()
                 self._arbiter.require_neutral(asked_ns)
@@ -554,7 +556,6 @@ class Robot:
             self._life.deactivate(by, now)
             numbers = (self._life.latches.last,)
         self._life.port_released = True
-        self._odometry.uncertainty.lose()
         self._checks.gyro.rest_s = 0.0
         return PORT_LENT, numbers
 

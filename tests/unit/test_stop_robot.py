@@ -68,11 +68,11 @@ def test_the_pose_is_unknown_after_another_program_had_the_port_until_it_is_set(
     rig.unplug().step(ms=10_000)
     assert rig.replug().linked().out.estimates[-1].covariance != UNKNOWN_POSE
     (answer,) = rig.asked(Request("deactivate", 1, release_port=True)).answers
-    assert "the pose is unknown until" in answer.message.lower()
-    rig.unplug().step(ms=100)
-    rig.replug().asked(Request("activate", 2, numbers=answer.numbers))
+    assert "unknown until `acsard call reset_odometry`" in answer.message
+    rig.unplug().asked(Request("reset_odometry", 2))
+    rig.replug().asked(Request("activate", 3, numbers=answer.numbers))
     assert rig.linked().out.estimates[-1].covariance == UNKNOWN_POSE
-    rig.asked(Request("reset_odometry", 3))
+    rig.asked(Request("reset_odometry", 4))
     rig.run(5)
     assert rig.out.estimates[-1].covariance.xx < 1e-4
 
