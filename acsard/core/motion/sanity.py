@@ -37,16 +37,8 @@ COARSEST_COUNT = math.tau / 16
 
 MIN_COUNT_S = 0.004  # boards that are asked more often repeat their speeds
 
-# 98.2 rad/s: above it, only counts excuse a speed over `feedback.wheel_speed`.
-MAX_STEP = COARSEST_COUNT / MIN_COUNT_S
-
-MAX_REPORTS = 2  # of the same count: firmware that is asked again very soon repeats its speeds once
-
 # Least time between two lines: while this computer catches up, one count would look fast.
 MIN_INTERVAL_S = 0.004
-
-
-NOT_FAST, AT_REST = (0, 0, 0, 0), (0.0, 0.0, 0.0, 0.0)
 
 
 class Sanity(Struct):
@@ -63,17 +55,13 @@ class Sanity(Struct):
     since: float = 0.0  # s since `last`
     longest: float = 0.0  # s that a recent line covers (recent for as long)
     count: int = 0  # of the last impossible lines
-    fast: tuple[int, int, int, int] = NOT_FAST  # successive lines of each wheel over the limit
-    # Sums of the speeds in these lines, rad/s. A speed far above the limit is damage, so each
-    # adds the limit and a quantization step at most.
-    totals: Motors = AT_REST
     lines: int = 0  # of the window
     dropped: int = 0  # impossible ones of the window
     warning: Event | None = None  # only if the last line caused it
 
     def forget(self) -> None:
         """Start over after a lost link or a cleared fault; the last line is not trusted."""
-        self.trusted, self.count, self.fast = False, 0, NOT_FAST
+        self.trusted, self.count = False, 0
 
     @property
     def doubtful(self) -> bool:
@@ -92,7 +80,7 @@ class Sanity(Struct):
         longest = self.longest - since if self.longest > since else 0.0
         self.longest = longest if longest > since else since
         if feedback.gap:
-            self.last, self.fast = None, NOT_FAST
+            self.last = None
             self.rejected.clear()
         speeds, last = feedback.speeds, self.last
         wheels = speeds.as_tuple()
@@ -110,8 +98,6 @@ class Sanity(Struct):
                     agrees = not self.trusted and self._agrees(feedback, longest)
                     self.rejected = [*self.rejected[1 - FAULT_LINES :], (speeds, self.since)]
                     why = "" if agrees else why
-        else:
-            self.fast = NOT_FAST
         self.lines += 1
         self.warning = None
         if why:
@@ -153,47 +139,22 @@ class Sanity(Struct):
         )
 
     def _too_fast(self, line: Feedback, fastest: RadPerS) -> str:
-        wheels = line.speeds.as_tuple()
-        turned, own = _proven(line), line.dt - line.bridged
+        wheels, turned = line.speeds.as_tuple(), _proven(line)
+        own = line.dt - line.bridged
         # A line without a known time moves nothing, so no count in it is excused.
-        count = COARSEST_COUNT / max(own, MIN_COUNT_S) if own > 0.0 else 0.0
+        coarsest = COARSEST_COUNT / max(own, MIN_COUNT_S) if own > 0.0 else 0.0
         # While other wheels rest, damaged lines of one wheel look like the steps of its encoder.
         learned = max(line.steps) < math.inf
-        a, b, c, d = (
-            lines + 1 if abs(now) > fastest else 0
-            for now, lines in zip(wheels, self.fast, strict=True)
-        )
-        self.fast = a, b, c, d
-        front_right, front_left, rear_left, rear_right = (
-            min(abs(now), fastest + step) + (total if lines > 1 else 0.0)
-            for now, total, step, lines in zip(
-                wheels, self.totals, line.steps, self.fast, strict=True
-            )
-        )
-        self.totals = front_right, front_left, rear_left, rear_right
-        rows = zip(
-            WHEELS, wheels, line.steps, turned or wheels, self.fast, self.totals, strict=True
-        )
-        for name, now, step, angle, lines, total in rows:
+        for name, now, step, angle in zip(
+            WHEELS, wheels, line.steps, turned or wheels, strict=True
+        ):
             size = abs(now)
-            if not lines:
-                continue
             if line.count and turned is not None:
                 # Of n reported counts, n - 1 certainly occurred in the time of the line.
-                room = size * min(1.0, line.count / abs(angle)) if angle else size
-            elif learned and size <= MAX_STEP:
-                # A sum of speeds is wrong by one step, or two if lines are repeated, so a lasting
-                # speed is soon evident.
-                room = step
-                if total / lines > fastest + step * min(1.0, MAX_REPORTS / lines):
-                    room = 0.0
-            elif learned or size > count:
-                room = 0.0  # No encoder has so large a step, so the line is damaged.
+                most = fastest + (size * min(1.0, line.count / abs(angle)) if angle else size)
             else:
-                # The board may repeat the speeds of the line before, so n successive fast lines
-                # have n / 2 counts at least, of which all but one certainly occurred.
-                room = size * min(1.0, MAX_REPORTS / lines)
-            if size > fastest + room:
+                most = fastest + step if learned else max(fastest, coarsest)
+            if size > most:
                 return f"{name} at {now:.2f} rad/s is over feedback.wheel_speed"
         return ""
 
