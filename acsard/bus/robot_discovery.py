@@ -11,7 +11,7 @@ import zenoh
 from msgspec import Struct
 
 from acsard.bus.address import require_id
-from acsard.bus.subscription import Subscription, queue_on
+from acsard.bus.subscription import Subscription
 from acsard.core.config.settings import is_tls
 from acsard.core.formatting import listed, many
 from acsard.core.messages.keys_and_roles import JSON_TREE, Topic, by_key, full_key, key_hint, row_of
@@ -112,7 +112,7 @@ def follow(session: zenoh.Session, ids: Sequence[str], name: str) -> Subscriptio
     latched = topic is not None and topic.latched
     keys = [full_key(robot_id, name) for robot_id in ids]
     try:
-        return Subscription(queue_on(session, *keys, latched=latched))
+        return Subscription(session, *keys, latched=latched, exact=False)
     except zenoh.ZError:
         raise UsageError(f"{name!r} is not a key; `acsard topics` lists them") from None
 

@@ -21,12 +21,31 @@ def direct(callback: Callable[[Any], None]) -> Any:
     return zenoh.handlers.Callback(callback, indirect=False)
 
 
-class Arrivals(Mailbox[zenoh.Sample]):
-    """The queue of a subscription. Zenoh's thread adds the samples, and a reader takes them."""
+class Subscription(Mailbox[zenoh.Sample]):
+    """The samples of keys, in the order of their arrival. Zenoh's thread adds them."""
 
-    def __init__(self) -> None:
+    def __init__(
+        self, session: zenoh.Session, *keys: str, latched: bool = False, exact: bool = True
+    ) -> None:
+        # With `latched`, the last sample that was published on each key comes first. If `exact`,
+        # samples that were not put on exactly one of the keys, as with a wildcard, are skipped.
         super().__init__(MAX_QUEUED_SAMPLES)
-        self.declared: list[Any] = []  # the Zenoh subscribers that fill this queue
+        self._exact_keys, self._declared = keys if exact else (), list[Any]()
+        handler = zenoh.handlers.Callback(self.put, self.close)
+        for key in keys:
+            if latched:
+                history = zenoh.ext.HistoryConfig(detect_late_publishers=True, max_samples=1)
+                subscriber: Any = zenoh.ext.declare_advanced_subscriber(
+                    session, key, handler, history=history
+                )
+            else:
+                subscriber = session.declare_subscriber(key, handler)
+            self._declared.append(subscriber)
+
+    def put(self, item: zenoh.Sample) -> bool:
+        if self._exact_keys and str(item.key_expr) not in self._exact_keys:
+            return False
+        return super().put(item)
 
     def try_recv(self) -> zenoh.Sample | None:
         """Return the next sample, or None; raise `ZError` if the session has closed."""
@@ -34,35 +53,6 @@ class Arrivals(Mailbox[zenoh.Sample]):
         if sample is None and self.closed and not self.waiting:
             raise zenoh.ZError("the Zenoh session has been closed")
         return sample
-
-    def undeclare(self) -> None:
-        for subscriber in self.declared:
-            subscriber.undeclare()
-
-
-class Subscription:
-    """The samples of the keys to which a client has subscribed, in the order of their arrival."""
-
-    def __init__(self, queue: Any, key: str = "") -> None:
-        # Samples that were not put on exactly `key`, as with a wildcard, are skipped.
-        self._queue, self._key = queue, key
-
-    def try_recv(self) -> zenoh.Sample | None:
-        """Return the next sample, or None; raise `ZError` if the session has closed."""
-        # The loop is bounded, because a flood of samples on other keys must not block the caller.
-        for _ in range(MAX_QUEUED_SAMPLES):
-            sample: zenoh.Sample | None = self._queue.try_recv()
-            if sample is None or not self._key or has_exact_key(self._key, sample):
-                return sample
-        return None
-
-    def wakes(self, wake: Callable[[], object]) -> None:
-        """Let Zenoh's thread call `wake` when a sample arrives or the subscription ends."""
-        self._queue.wakes(wake)
-
-    def add(self, sample: zenoh.Sample) -> None:
-        """Append a sample from the reply to a query, as if the sample had just been published."""
-        self._queue.put(sample)
 
     def until_silence(
         self, timeout: float | None, look: Callable[[float], None] | None = None
@@ -89,7 +79,7 @@ class Subscription:
                 if look is not None:
                     look(quiet_s)
                     left_s = 1.0 if left_s is None else min(1.0, left_s)
-                self._queue.wait(left_s)
+                self.wait(left_s)
         finally:
             self.undeclare()
 
@@ -104,7 +94,7 @@ class Subscription:
             with suppress(RuntimeError):
                 loop.call_soon_threadsafe(arrived.set)
 
-        self._queue.wakes(wake)
+        self.wakes(wake)
         try:
             while True:
                 arrived.clear()
@@ -121,10 +111,9 @@ class Subscription:
 
     def undeclare(self) -> None:
         """Undeclare the Zenoh subscribers, unless the session has closed."""
-        try:
-            self._queue.undeclare()
-        except zenoh.ZError:
-            pass  # closing the session has undeclared them
+        for subscriber in self._declared:
+            with suppress(zenoh.ZError):  # closing the session has undeclared them
+                subscriber.undeclare()
 
 
 def has_exact_key(key: str, sample: zenoh.Sample) -> bool:
@@ -135,22 +124,3 @@ def has_exact_key(key: str, sample: zenoh.Sample) -> bool:
 def encoded(sample: zenoh.Sample) -> tuple[str, bytes]:
     """Return the encoding and the payload of a sample, as `Decoder.decode` expects them."""
     return str(sample.encoding), sample.payload.to_bytes()
-
-
-def queue_on(session: zenoh.Session, *keys: str, latched: bool) -> Arrivals:
-    """Subscribe to full keys, and return the queue of their samples.
-
-    With `latched`, the last sample that was published on each key comes first.
-    """
-    arrivals = Arrivals()
-    handler = zenoh.handlers.Callback(arrivals.put, arrivals.close)
-    for key in keys:
-        if latched:
-            history = zenoh.ext.HistoryConfig(detect_late_publishers=True, max_samples=1)
-            subscriber: Any = zenoh.ext.declare_advanced_subscriber(
-                session, key, handler, history=history
-            )
-        else:
-            subscriber = session.declare_subscriber(key, handler)
-        arrivals.declared.append(subscriber)
-    return arrivals

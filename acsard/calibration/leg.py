@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 import zenoh
 
-from acsard.bus.subscription import Subscription, encoded, queue_on
+from acsard.bus.subscription import Subscription, encoded
 from acsard.calibration.fit import ASIDE, Base
 from acsard.calibration.log import APPLIED, Floats, LogError, Notes, Run, run_of
 from acsard.calibration.plan import Leg, Move
@@ -62,7 +62,7 @@ class Sensor:
         columns: tuple[str, ...],
     ) -> None:  # fmt: skip
         self.key, self.columns, self._values = key, columns, values
-        self._samples = Subscription(queue_on(session, key, latched=False), key)
+        self._samples = Subscription(session, key)
         self._decoders: list[Decoder[Any]] = [Decoder(type_) for type_ in types]
         self.rows: list[tuple[float, ...]] = []  # arrival, stamp (0 if unknown), values
 

@@ -21,7 +21,7 @@ import zenoh
 
 from acsard.bus.address import Address
 from acsard.bus.robot_discovery import NO_BATTERY, explain_silence, presence
-from acsard.bus.subscription import Subscription, encoded, queue_on
+from acsard.bus.subscription import Subscription, encoded
 from acsard.bus.tls_files import shown_at
 from acsard.bus.zenoh_sessions import client_session
 from acsard.client.driving import UnheardError, repeat_zeros
@@ -365,7 +365,7 @@ class Connection(Reads):
         look: Callable[[float], None] | None = None,
     ) -> Iterator[zenoh.Sample]:
         """Yield samples of a key or wildcard, as `Subscription.until_silence` does."""
-        yield from Subscription(self._queue(name)).until_silence(timeout, look)
+        yield from self._subscription(name, exact=False).until_silence(timeout, look)
 
     def listen(self, name: str, callback: Callable[[zenoh.Sample], None]) -> Any:
         """Subscribe to a key. A thread of Zenoh calls `callback` with each sample.
@@ -382,7 +382,7 @@ class Connection(Reads):
 
         A caller can read the queue without waiting.
         """
-        return Subscription(self._queue(name), self.key(name))
+        return self._subscription(name, exact=True)
 
     def start_query(self, name: str, take: Callable[[zenoh.Sample], object]) -> None:
         """Query a key, and return immediately. A thread of Zenoh calls `take` with each reply.
@@ -395,12 +395,11 @@ class Connection(Reads):
             timeout=REPLY_TIMEOUT_S,
         )
 
-    def _queue(self, name: str) -> Any:
+    def _subscription(self, name: str, *, exact: bool) -> Subscription:
         topic = by_key(name)
+        latched = topic is not None and topic.latched
         try:
-            return queue_on(
-                self.session, self.key(name), latched=topic is not None and topic.latched
-            )
+            return Subscription(self.session, self.key(name), latched=latched, exact=exact)
         except zenoh.ZError:
             raise self._refused(name) from None
 

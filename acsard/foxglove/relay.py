@@ -13,7 +13,7 @@ import foxglove
 import msgspec
 import zenoh
 
-from acsard.bus.subscription import Subscription, encoded, queue_on
+from acsard.bus.subscription import Subscription, encoded
 from acsard.client.connection import Connection
 from acsard.client.reads import decoder
 from acsard.core.config.settings import Config
@@ -120,7 +120,7 @@ class Relay:
             if out is None or out.key not in self._followed:
                 continue
             if out.key == "events":
-                self._robot.start_query("events", self._followed["events"].add)
+                self._robot.start_query("events", self._followed["events"].put)
             elif out.key in ("tf_static", "diagnostics", "state") and out.last:
                 # These keys are published rarely, so a new viewer receives the last message.
                 out.channel.log(out.last)
@@ -130,11 +130,11 @@ class Relay:
     def _subscribed(self, key: str) -> Subscription:
         topic = by_key(key)
         assert topic is not None, key
-        arrivals = queue_on(self._robot.session, self._robot.key(key), latched=topic.latched)
-        arrivals.wakes(self._wake)
+        samples = self._robot.subscribe(key)
+        samples.wakes(self._wake)
         if not topic.latched:
-            self._robot.start_query(key, arrivals.put)  # the next message may be seconds away
-        return Subscription(arrivals, self._robot.key(key))
+            self._robot.start_query(key, samples.put)  # the next message may be seconds away
+        return samples
 
     def forward(self) -> None:
         """Forward the messages that have arrived since the last call."""

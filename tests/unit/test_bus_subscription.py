@@ -4,33 +4,47 @@ from __future__ import annotations
 
 import asyncio
 import threading
-from collections import deque
 from types import SimpleNamespace
 from typing import Any
 
 import pytest
 import zenoh
 
-from acsard.bus.subscription import MAX_QUEUED_SAMPLES, Subscription, queue_on
+from acsard.bus.subscription import MAX_QUEUED_SAMPLES, Subscription
 
 KEY, WILDCARD = "acsard/acsar/state", "acsard/**"
 
 
-class Queue:
-    """A stand-in for Zenoh's queue."""
+class Session:
+    """A session whose subscriptions receive their samples from the test."""
 
-    def __init__(self, *keys: str) -> None:
-        self.held = deque(SimpleNamespace(key_expr=key, number=n) for n, key in enumerate(keys))
-        self.open = True
+    def __init__(self, *, closed: bool = False) -> None:
+        self.handlers, self.undeclared, self._closed = list[Any](), 0, closed
 
-    def try_recv(self) -> Any:
-        return self.held.popleft() if self.held else None
+    def declare_subscriber(self, key: str, handler: Any) -> Any:
+        self.handlers.append(handler)
+        return SimpleNamespace(undeclare=self._undeclare)
 
-    def wait(self, seconds: float | None) -> None:
-        """Return at once, because the test sends no further sample."""
+    def _undeclare(self) -> None:
+        if self._closed:
+            raise zenoh.ZError("already undeclared")
+        self.undeclared += 1
 
-    def undeclare(self) -> None:
-        self.open = False
+
+def sample(number: int, key: str = KEY) -> Any:
+    return SimpleNamespace(key_expr=key, number=number)
+
+
+def declared(*keys: str, exact: bool = True, closed: bool = False) -> tuple[Any, Subscription, Any]:
+    """Return the handler of a subscription to `KEY`, which has samples of these keys."""
+    session: Any = Session(closed=closed)
+    subscription = Subscription(session, KEY, exact=exact)
+    (handler,) = session.handlers
+    for number, key in enumerate(keys):
+        handler.callback(sample(number, key))
+    if closed:
+        handler.drop()
+    return handler, subscription, session
 
 
 def numbers(subscription: Subscription) -> list[int]:
@@ -40,70 +54,31 @@ def numbers(subscription: Subscription) -> list[int]:
 
 def test_a_subscription_yields_the_samples_of_its_key_or_all() -> None:
     # A sample that was put on a wildcard does not count for the key.
-    assert numbers(Subscription(Queue(KEY, WILDCARD, WILDCARD, KEY), KEY)) == [0, 3]
-    assert numbers(Subscription(Queue(KEY, WILDCARD, KEY))) == [0, 1, 2]
-
-
-def test_a_flood_on_other_keys_does_not_hold_the_caller() -> None:
-    queue = Queue(*[WILDCARD] * (MAX_QUEUED_SAMPLES + 1), KEY)
-    subscription = Subscription(queue, KEY)
-    assert subscription.try_recv() is None
-    assert len(queue.held) == 2
-    assert subscription.try_recv() is not None
+    keys = (KEY, WILDCARD, WILDCARD, KEY)
+    assert numbers(declared(*keys)[1]) == [0, 3]
+    assert numbers(declared(*keys, exact=False)[1]) == [0, 1, 2, 3]
 
 
 def test_a_subscription_is_undeclared_after_a_silence_and_when_its_reader_leaves() -> None:
-    silent, left = Queue(), Queue(KEY, KEY)
-    assert numbers(Subscription(silent)) == []
-    reader: Any = Subscription(left).until_silence(None)
+    _, silent, session = declared()
+    assert numbers(silent) == []
+    assert session.undeclared == 1
+    _, left, session = declared(KEY, KEY)
+    reader: Any = left.until_silence(None)
     next(reader)
     reader.close()
-    assert (silent.open, left.open) == (False, False)
-
-
-class Closed(Queue):
-    """A queue whose session has been closed while the queue was still in use."""
-
-    def try_recv(self) -> Any:
-        if not self.held:
-            raise zenoh.ZError("receiving on a closed channel")
-        return super().try_recv()
-
-    def undeclare(self) -> None:
-        raise zenoh.ZError("already undeclared")
+    assert session.undeclared == 1
 
 
 def test_a_subscription_ends_without_an_error_when_its_session_is_closed() -> None:
-    assert numbers(Subscription(Closed(KEY, KEY))) == [0, 1]
-    Subscription(Closed()).undeclare()
+    assert numbers(declared(KEY, KEY, closed=True)[1]) == [0, 1]
 
 
 # samples that Zenoh's thread hands over
 
 
-class Session:
-    """A session whose subscriptions receive their samples from the test."""
-
-    def __init__(self) -> None:
-        self.handlers: list[Any] = []
-
-    def declare_subscriber(self, key: str, handler: Any) -> Queue:
-        self.handlers.append(handler)
-        return Queue()
-
-
-def declared() -> tuple[Any, Subscription]:
-    session: Any = Session()
-    queue = queue_on(session, KEY, latched=False)
-    return session.handlers[0], Subscription(queue)
-
-
-def sample(number: int) -> Any:
-    return SimpleNamespace(key_expr=KEY, number=number)
-
-
 def test_a_reader_sleeps_until_a_sample_arrives_and_ends_when_the_session_is_closed() -> None:
-    handler, subscription = declared()
+    handler, subscription, _ = declared()
     asleep: Any = subscription.until_silence(None)
 
     def other() -> None:
@@ -130,7 +105,7 @@ def test_a_reader_sleeps_until_a_sample_arrives_and_ends_when_the_session_is_clo
 
 
 async def test_a_sample_or_the_end_wakes_an_asyncio_reader() -> None:
-    handler, subscription = declared()
+    handler, subscription, _ = declared()
     for number in range(2):
         handler.callback(sample(number))
     asyncio.get_running_loop().call_later(0.05, handler.callback, sample(2))
@@ -140,7 +115,7 @@ async def test_a_sample_or_the_end_wakes_an_asyncio_reader() -> None:
 
 
 def test_the_newest_samples_of_a_flood_are_kept() -> None:
-    handler, subscription = declared()
+    handler, subscription, _ = declared()
     for number in range(MAX_QUEUED_SAMPLES + 5):
         handler.callback(sample(number))
     handler.drop()

@@ -12,7 +12,6 @@ import zenoh
 from msgspec.structs import replace
 
 from acsard.bus.address import Address
-from acsard.bus.subscription import Subscription
 from acsard.client.follower import (
     FLEET_QUERY_PERIOD_S,
 )
@@ -153,7 +152,7 @@ def test_rates_are_between_two_states_of_one_daemon_by_the_viewer_s_clock(
     queue: Any = SimpleNamespace(try_recv=lambda: sample_of(states.pop(0), key) if states else None)
     robot: Any = SimpleNamespace(
         where=Address("tcp/127.0.0.1:7448", "acsar", ""), get=lambda _: INFO, key=lambda _: key,
-        start_query=lambda *_: None, subscribe=lambda _: Subscription(queue, key),
+        start_query=lambda *_: None, subscribe=lambda _: queue,
     )  # fmt: skip
     feed = Feed(robot)
     feed.poll()
