@@ -341,7 +341,7 @@ threading.Thread(target=listen, daemon=True).start()
 session = zenoh.open(config)
 keep = session.declare_subscriber("acsard/acsar/state", show)
 while True:
-    now = 0.0 if patrols and time.monotonic() % 2.0 < 0.3 else speed
+    now = 0.0 if patrols and time.monotonic() % 1.0 < 0.3 else speed
     sequence += 1
     signature = {"sender": "patrol", "stamp": time.monotonic_ns(), "sequence": sequence}
     session.put(
@@ -367,7 +367,7 @@ class Driver(Program):
         self.process.stdin.flush()
 
     def patrols(self, speed: float = 0.3) -> None:
-        """Send zeros for 0.3 s every 2 s, and this speed in between, under a separate sender id."""
+        """Send zeros for 0.3 s every second, and this speed in between, under its own sender id."""
         assert self.process.stdin is not None
         self.process.stdin.write(f"{speed} patrols\n".encode())
         self.process.stdin.flush()

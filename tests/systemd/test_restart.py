@@ -1,6 +1,6 @@
 """A latched robot stands until its release, however systemd ends and restarts the unit.
 
-A commander sends zeros for 0.3 s every 2 s and a speed in between. It therefore arms itself, and
+A commander sends zeros for 0.3 s every second and a speed in between. It therefore arms itself, and
 only the latch prevents the robot from driving.
 """
 
@@ -30,7 +30,7 @@ from tests.systemd.container import (
 
 pytestmark = pytest.mark.systemd
 
-CYCLE_S = 2.0
+CYCLE_S = 1.0
 FILE = f"{STATES}/acsard/acsar.latches.json"
 MODES = {"stop": "stopped", "fault": "fault", "deactivate": "inactive"}
 ENDS = {"kill": "fault", "watchdog": "stop", "restart": "deactivate"}
@@ -43,7 +43,7 @@ def moves(board: Board, since: float) -> bool:
 
 def drives(board: Board) -> None:
     since = time.monotonic()
-    until(lambda: moves(board, since), 2 * CYCLE_S, "the commander drives")
+    until(lambda: moves(board, since), 3 * CYCLE_S, "the commander drives")
 
 
 def has_mode(driver: Driver, mode: str) -> None:
@@ -74,8 +74,7 @@ def check_at_rest(
 ) -> None:
     """Check that the robot stands although the commander has tried to drive it."""
     has_mode(driver, MODES[cause])
-    up = time.monotonic()
-    until(lambda: time.monotonic() > up + 1.5 * CYCLE_S, 1.5 * CYCLE_S, "the time is over")
+    time.sleep(2 * CYCLE_S)
     assert not moves(board, since)
     assert "before the restart" in container.show("StatusText")
 
