@@ -155,8 +155,6 @@ class Motor(NamedTuple):
     """Counts of its encoder since power on, 64 bits."""
     since_reset: int
     """Counts of its encoder since the firmware began to count."""
-    flips: int
-    """Number of times that the bridge changed direction."""
     flip_duty: float
     """The highest duty at which the bridge ever changed direction, 0 to 1."""
 
@@ -182,8 +180,6 @@ class Status(NamedTuple):
     """
 
     virtual_ns: int
-    wall_ns: int
-    """The monotonic clock of this machine, now."""
     base_ns: int
     """Add this to a virtual time to get the monotonic clock's."""
     skipped_ns: int
@@ -209,9 +205,6 @@ class Status(NamedTuple):
     """Number of changes of the speeds that the firmware wants of the motors."""
     wrong: int
     """Number of those changes that are in none of the lines which the host has just sent."""
-    wrong_one: Sequence[int]
-    """The last such speeds, hundredths of a rad/s."""
-    open: bool
     contact_ns: int
     """Time when a contact was last opened or closed."""
     reported_ns: int
