@@ -11,7 +11,7 @@ from acsard.bus.robot_discovery import ALL_ROBOTS, count_text, running_robots
 from acsard.client.connection import Connection
 from acsard.core import formatting
 from acsard.core.formatting import printable
-from acsard.core.messages.encodings import DecodeError, detect, encode
+from acsard.core.messages.encodings import DecodeError, encode, to_json
 from acsard.core.messages.schema import ServiceReply
 from acsard.core.values import AcsardError
 from acsard.host.errors import Exit, NotPermittedError
@@ -26,12 +26,8 @@ def of_robot(whose: str, line: str) -> str:
 def json_line(encoding: str, payload: bytes) -> str:
     """Return a payload as a line of JSON, or `{"undecodable": ...}` for CDR and damage."""
     try:
-        form = detect(encoding, payload)
-        if form == "cdr":
-            raise DecodeError("unknown_encoding", "a CDR message does not contain its type")
-        codec = msgspec.json if form == "json" else msgspec.msgpack
-        return msgspec.json.encode(codec.decode(payload)).decode()
-    except (DecodeError, msgspec.MsgspecError, ValueError, TypeError, RecursionError):
+        return to_json(encoding, payload).decode()
+    except DecodeError:
         return msgspec.json.encode({"undecodable": repr(payload)}).decode()
 
 

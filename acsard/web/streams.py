@@ -11,12 +11,11 @@ from collections.abc import Callable
 from contextlib import suppress
 from typing import Any
 
-import msgspec
 import zenoh
 
 from acsard.bus.subscription import encoded, has_exact_key
 from acsard.client.connection import Connection
-from acsard.core.messages.encodings import DecodeError, detect
+from acsard.core.messages.encodings import DecodeError, to_json
 from acsard.core.messages.keys_and_roles import FOLLOWED
 from acsard.host import clock
 from acsard.host.errors import NoAnswerError
@@ -106,8 +105,6 @@ def _subscribe(client: Connection, key: str, stream: Stream) -> None:
 def as_json(encoding: str, payload: bytes) -> bytes:
     """Return a JSON or msgpack message as JSON, or as `null` if it cannot be decoded."""
     try:
-        known = detect(encoding, payload) == "json"
-        value = msgspec.json.decode(payload) if known else msgspec.msgpack.decode(payload)
-        return payload if known else msgspec.json.encode(value)
-    except (DecodeError, msgspec.MsgspecError, ValueError, RecursionError, TypeError):
+        return to_json(encoding, payload)
+    except DecodeError:
         return b"null"

@@ -78,6 +78,18 @@ def detect(encoding: str, payload: bytes) -> Format:
     )
 
 
+def to_json(encoding: str, payload: bytes) -> bytes:
+    """Return a payload of any type in JSON. Raises `DecodeError`, also for CDR."""
+    form = detect(encoding, payload)
+    if form == "cdr":
+        raise DecodeError("unknown_encoding", "a CDR message does not contain its type")
+    codec = msgspec.json if form == "json" else msgspec.msgpack
+    try:
+        return msgspec.json.encode(codec.decode(payload))
+    except (msgspec.MsgspecError, ValueError, TypeError, RecursionError) as error:
+        raise DecodeError("malformed", str(error)) from None
+
+
 class Decoder(Generic[T]):
     """Decodes payloads of one message type in msgpack, JSON and, for ROS types, CDR.
 
