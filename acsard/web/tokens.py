@@ -33,9 +33,6 @@ FILE = "tokens.json"
 # State directory of the service `acsard-web`.
 SERVICE_DIRECTORY = Path("/var/lib/acsard-web")
 
-# of one robot
-MAX_TOKENS = 200
-
 # Of the time in the token file: more writes would wear out an SD card.
 TIME_PERIOD_S = 60
 
@@ -101,20 +98,14 @@ class Vault:
     def invite(self, role: Role, name: str, days: int, hours: int = 0) -> tuple[str, Token]:
         """Create a token, and return its text, which is stored nowhere, and its record.
 
-        Raises `UsageError` for a name in use, or for too many tokens.
+        Raises `UsageError` for a name in use.
         """
         with self._changing() as rows:
             now_s = int(self.now_s())
-            ours = self._own(rows)
-            if any(record.name == name for record in ours):
+            if any(record.name == name for record in self._own(rows)):
                 raise UsageError(
                     f"the token {name} exists already: either give another --name, or revoke the "
                     f"old token with `acsard web revoke {name}`"
-                )
-            if len(ours) >= MAX_TOKENS:
-                raise UsageError(
-                    f"the robot already has {MAX_TOKENS} tokens: revoke some with `acsard web "
-                    "revoke NAME`"
                 )
             text = secrets.token_urlsafe(32)
             ends = now_s + 3600 * (24 * days + hours)
