@@ -99,10 +99,9 @@ def main(args: argparse.Namespace) -> int:
         if "INVOCATION_ID" not in os.environ:
             # Do not use print, because a full pipe that no program reads would block the control
             # loop.
-            banner_text = banner(
-                config, where, device, trouble, reach(args), served=served is not None
-            )
-            screen.write(banner_text + "\n")
+            shown = served is not None
+            text = banner(config, where, device, trouble, reach(args), served=shown)
+            screen.write(f"{text}\n")
         log.info(
             "started",
             version=version(),
@@ -116,13 +115,8 @@ def main(args: argparse.Namespace) -> int:
         for text in warnings(config):
             log.event(Event("configuration", text, "warning"))
 
-    gateway = [
-        "gateway",
-        *(("--config", where) if config.bus.outside else ()),
-        "--id",
-        config.robot.id,
-    ]
-    gateway += ["--namespace", config.ros.namespace]
+    gateway = ["gateway", "--id", config.robot.id, "--namespace", config.ros.namespace]
+    gateway += ["--config", where] if config.bus.outside else []
     # The systemd watchdog ends a hanging daemon with SIGABRT. With this handler, the daemon then
     # writes a traceback of the hang to standard error. `sys.stderr` is None if standard error was
     # closed before the start.
@@ -130,15 +124,8 @@ def main(args: argparse.Namespace) -> int:
         faulthandler.enable()
     try:
         with asyncio.Runner(loop_factory=EventLoop) as runner:
-            runner.run(
-                daemon.run(
-                    config,
-                    log,
-                    announce,
-                    None if args.no_gateway else gateway,
-                    served,
-                )
-            )
+            own_gateway = None if args.no_gateway else gateway
+            runner.run(daemon.run(config, log, announce, own_gateway, served))
     except InUseError as error:
         raise InUseError(_owner(config) or str(error)) from error
     finally:
