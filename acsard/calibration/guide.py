@@ -17,7 +17,7 @@ from msgspec.structs import replace
 
 from acsard.bus.zenoh_sessions import client_session
 from acsard.calibration.leg import Recorder
-from acsard.calibration.log import Floats, Log, LogError, Run, TapeReading
+from acsard.calibration.log import Log, LogError, Run, TapeReading
 from acsard.calibration.plan import METHODS, WHEELBASE, Leg, Setup, legs
 from acsard.client.connection import Connection
 from acsard.client.ride import NEVER_DRIVING_MODES
@@ -183,20 +183,16 @@ def _measured(driven: Sequence[Driven], wheelbase: Metres, drive: DriveConfig) -
             std = math.hypot(TAPE_STD_M, SKID_LENGTH * metres)
             readings.append(TapeReading("distance", metres, std))
         if "front" in found:
-            before, slope = slope, line_angle(found["front"], found["rear"], wheelbase)
-            rolled = drive.wheel_radius * (_rolled(run.left) + _rolled(run.right)) / 2
+            before, slope = slope, _line_angle(found["front"], found["rear"], wheelbase)
+            rolled = drive.wheel_radius * float(np.abs(np.diff([run.left, run.right])).sum()) / 2
             std = math.hypot(2 * LINE_STD_M / wheelbase, SKID_HEADING * math.sqrt(rolled))
             readings.append(TapeReading("turn", leg.whole_turns + slope - before, std))
         runs.append(replace(run, tape=tuple(readings)))
     return runs
 
 
-def _rolled(angles: Floats) -> float:
-    return float(np.abs(np.diff(angles)).sum())
-
-
-def line_angle(front: Metres, rear: Metres, wheelbase: Metres) -> Rad:
-    """Return the angle of the robot to a line on its left, positive after a turn to the left."""
+def _line_angle(front: Metres, rear: Metres, wheelbase: Metres) -> Rad:
+    # Of the robot to a line on its left, positive after a turn to the left.
     sine = (rear - front) / wheelbase
     if abs(sine) > 0.98:
         raise LogError(
