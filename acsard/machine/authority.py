@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import ipaddress
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
@@ -64,17 +64,13 @@ class Authority:
         return cls(certificate, key)
 
     @classmethod
-    def load(cls, directory: Path, password: Callable[[], str]) -> Authority:
-        """Load the authority; `password` is called if its key is encrypted.
+    def load(cls, directory: Path) -> Authority:
+        """Load the authority.
 
-        Raises `OSError` or `ValueError`, also for one that has expired.
+        Raises `OSError` or `ValueError`, also for one that has expired, and `TypeError` if its key
+        is encrypted.
         """
-        data = (directory / CA_KEY).read_bytes()
-        try:
-            key = serialization.load_pem_private_key(data, None)
-        # An encrypted key without a password raises this error.
-        except TypeError:
-            key = serialization.load_pem_private_key(data, password().encode())
+        key = serialization.load_pem_private_key((directory / CA_KEY).read_bytes(), None)
         if not isinstance(key, ec.EllipticCurvePrivateKey):
             raise ValueError(f"{CA_KEY} is not a P-256 key")
         certificate = x509.load_pem_x509_certificate((directory / CA).read_bytes())

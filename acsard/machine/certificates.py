@@ -10,16 +10,14 @@ import os
 import re
 import shlex
 import socket
-import sys
 from collections.abc import Sequence
-from getpass import getpass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from acsard.bus.tls_files import CA, CERTIFICATE, KEY
 from acsard.core.config.settings import Config, is_tls
 from acsard.core.values import ROLES
-from acsard.host.errors import MendableError, NotPermittedError, UsageError
+from acsard.host.errors import MendableError, NotPermittedError
 from acsard.host.extras import missing
 from acsard.host.own_identity import own_addresses
 
@@ -171,9 +169,7 @@ def _load(directory: Path) -> Authority:
     maker = _maker()
     _writable(directory)
     try:
-        return maker.load(directory, _password)
-    except UsageError:  # `UsageError` is a `ValueError` too, and its text is complete already
-        raise
+        return maker.load(directory)
     except FileNotFoundError:
         if (directory / CA).exists():
             text = (
@@ -187,22 +183,10 @@ def _load(directory: Path) -> Authority:
                 "first"
             )
         raise MendableError(text) from None
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, TypeError) as error:
         raise MendableError(
             f"cannot use the certificate authority in {directory}: {error}"
         ) from None
-
-
-def _password() -> str:
-    if not sys.stdin.isatty():
-        raise UsageError(
-            "the private key of the certificate authority is encrypted: run this command in a "
-            "terminal, where it asks for the password",
-        )
-    try:
-        return getpass(f"password of {CA_KEY}: ")
-    except EOFError:
-        raise UsageError("no password was typed: run this command again") from None
 
 
 def _writable(directory: Path) -> None:

@@ -56,7 +56,7 @@ class Certificates:
 
     def issue(self, directory: Path, name: str, days: float) -> None:
         """Issue one more certificate by this robot's authority."""
-        Authority.load(self.robot, str).issue(directory, name, [], days)
+        Authority.load(self.robot).issue(directory, name, [], days)
 
     def config(self, identity: Identity, plain: str, tls: str) -> zenoh.Config:
         """Return the Zenoh settings of a client with this identity.

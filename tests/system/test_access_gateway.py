@@ -87,7 +87,7 @@ def test_a_new_certificate_is_used_and_the_daemon_runs_on(tmp_path: Path) -> Non
         assert robot.lets_in("viewer")
         before_ns = peer_ends_ns(robot.tls, str(own))
         key = (own / KEY).read_bytes()
-        Authority.load(own, str).issue(own, "robot", ["127.0.0.1"], 0.5)
+        Authority.load(own).issue(own, "robot", ["127.0.0.1"], 0.5)
         new = (own / KEY).read_bytes()
         (own / KEY).write_bytes(key)  # as long as a person has copied only a part of the files
         time.sleep(3 * FILES_CHECK_PERIOD_NS / NS_PER_S)

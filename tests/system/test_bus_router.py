@@ -29,7 +29,7 @@ def where(tmp_path: Path) -> Path:
 def test_a_robot_reports_the_end_of_its_routers_certificate(where: Path) -> None:
     endpoint, plain = free_tls_endpoint(), free_endpoint()
     robot = where / "robot1"
-    Authority.load(where, str).issue(robot, "robot1", [], 5)
+    Authority.load(where).issue(robot, "robot1", [], 5)
     bus = {"listen": [plain], "connect": [endpoint], "tls": str(robot)}
     with acsard_router(where, endpoint) as router:
         listens(router)

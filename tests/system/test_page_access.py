@@ -64,7 +64,7 @@ async def test_a_new_certificate_is_used_and_open_connections_stay(
     async with hands(page, operator) as ours:
         await ours.find(lambda frame: "hello" in frame)
         names = [NAME, "renamed.local"]
-        Authority.load(page.tls, str).issue(page.tls, "robot", names, 0.5)
+        Authority.load(page.tls).issue(page.tls, "robot", names, 0.5)
         while (peer_ends_ns(endpoint, str(page.tls)) or 0) >= before_ns:
             await asyncio.sleep(0.2)
         await ours.say(subscribe="state", rate=50)

@@ -16,9 +16,6 @@ from cryptography import x509
 from cryptography.exceptions import InvalidSignature
 from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.hazmat.primitives.serialization import (
-    BestAvailableEncryption,
-    Encoding,
-    PrivateFormat,
     load_pem_private_key,
 )
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
@@ -236,29 +233,3 @@ def test_renew_replaces_that_certificate_alone_and_keeps_its_names(own: Path, na
     assert certificate(place).not_valid_after_utc > old.not_valid_after_utc
     kept = {"robot4.local", "10.0.0.4"} if name else {"localhost", "robot.example", "192.0.2.7"}
     assert names_of(place) == {*names, "10.0.0.9"} > kept
-
-
-def encrypt(own: Path, password: bytes) -> None:
-    key = load_pem_private_key((own / "ca-key.pem").read_bytes(), None)
-    (own / "ca-key.pem").write_bytes(
-        key.private_bytes(Encoding.PEM, PrivateFormat.PKCS8, BestAvailableEncryption(password))
-    )
-
-
-@pytest.mark.slow
-def test_an_encrypted_authority_s_password_is_asked_for(own: Path) -> None:
-    encrypt(own, b"secret")
-    words = [sys.executable, "-m", "acsard", "tls", "renew", "--directory", str(own)]
-    before = certificate(own).serial_number
-    leader, follower = os.openpty()
-    process = subprocess.Popen(
-        words, stdin=follower, stdout=follower, stderr=follower, start_new_session=True
-    )
-    os.close(follower)
-    output = b""
-    while b"password of ca-key.pem" not in output:
-        output += os.read(leader, 1024)
-    os.write(leader, b"secret\n")
-    assert process.wait(30.0) == 0
-    os.close(leader)
-    assert certificate(own).serial_number != before

@@ -32,7 +32,7 @@ def test_the_common_name_is_read_and_is_empty_for_an_unusable_certificate(
 ) -> None:
     require_usable(str(make_certificates(tmp_path)))
     assert common_name(str(tmp_path)) == "robot"
-    Authority.load(tmp_path, str).issue(tmp_path / "anna", "laptop-anna", [], 10)
+    Authority.load(tmp_path).issue(tmp_path / "anna", "laptop-anna", [], 10)
     assert common_name(str(tmp_path / "anna")) == "laptop-anna"
     (tmp_path / "certificate.pem").write_text("junk")
     assert common_name(str(tmp_path)) == common_name(str(tmp_path / "nobody")) == ""

@@ -62,7 +62,7 @@ def test_the_advised_command_replaces_a_key_that_only_zenoh_refuses(
     with monkeypatch.context() as patch:
         # OpenSSL accepts a key of this curve, and Zenoh does not.
         patch.setattr(ec, "SECP256R1", ec.SECP521R1)
-        Authority.load(fleet, str).issue(fleet, "robot", ["localhost"], 100)
+        Authority.load(fleet).issue(fleet, "robot", ["localhost"], 100)
     result = finding(fleet)
     assert result.level == "failure"
     assert f"the key {fleet}/key.pem (failed to parse private key" in result.text
@@ -78,7 +78,7 @@ def test_the_advised_commands_renew_the_certificate_of_a_robot_of_a_fleet(
 
     The operator renews the certificate on another computer.
     """
-    Authority.load(fleet, str).issue(fleet / "clients" / "robot4", "robot4", ["10.0.0.4"], days)
+    Authority.load(fleet).issue(fleet / "clients" / "robot4", "robot4", ["10.0.0.4"], days)
     there = tmp_path / "etc tls"
     shutil.copytree(fleet / "clients" / "robot4", there)
     result = finding(there)
@@ -143,7 +143,7 @@ def test_for_a_directory_that_this_user_may_not_look_into_sudo_is_advised(
 
 
 def expiring(fleet: Path) -> None:
-    Authority.load(fleet, str).issue(fleet, "robot", ["localhost"], 9.9)
+    Authority.load(fleet).issue(fleet, "robot", ["localhost"], 9.9)
     (fleet / "ca-key.pem").unlink()
 
 
