@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import os
 import socket
 import time
 from collections.abc import Iterator
@@ -145,6 +146,15 @@ def test_a_watchdog_that_is_off_broken_or_another_process_s_is_not_fed(
     manager: Manager, environment: dict[str, str]
 ) -> None:
     assert feeds(manager, systemd(manager, **environment), 10 * MS, 50) == []
+
+
+def test_an_abstract_socket_address_is_accepted() -> None:
+    manager = Manager(f"@acsard-test-{os.getpid()}")
+    try:
+        systemd(manager).ready()
+        assert manager.read_datagrams() == [{"READY": "1"}]
+    finally:
+        manager.close()
 
 
 # the status
