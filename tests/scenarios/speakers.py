@@ -20,9 +20,6 @@ Way = Literal["client", "signed", "rmw", "header", "zenoh", "routed", "plain", "
 FOREIGN: tuple[Way, ...] = ("signed", "rmw", "header", "zenoh")
 """Routes on which messages have stamps of a wall clock. Our own client echoes a beat."""
 STAMPED: tuple[Way, ...] = ("client", *FOREIGN)
-SHARED: tuple[Way, ...] = ("header", "zenoh", "routed", "plain", "bridge")
-"""Routes on which a program has no identity of its own, because it sends no sender id or GID."""
-
 AHEAD_NS = NS_PER_S // 2
 """Zenoh replaces a timestamp that is further ahead of the receiver's clock than this."""
 

@@ -11,7 +11,6 @@ from msgspec.structs import replace
 
 from acsard.core.config.settings import (
     Config,
-    LimitsConfig,
     McuConfig,
     SimConfig,
 )
@@ -55,12 +54,6 @@ def texts(world: World, name: str) -> list[str]:
     return [event.text for event in world.events if event.name == name]
 
 
-def off_by(world: World) -> float:
-    """Return the distance between pose and simulated robot, as a share of the path length."""
-    at, true = world.state, world.mcu.vehicle.pose
-    return math.hypot(at.x - true.x, at.y - true.y) / math.hypot(true.x, true.y)
-
-
 # the firmware at the other end
 
 
@@ -84,17 +77,6 @@ def test_a_new_mcu_is_driven_with_samples_when_counts_are_configured() -> None:
     world.drive(0.5, seconds=1.0)
     assert check_of(world) == "checked with samples"
     assert all(b"S*" in line for line in moving(world.lines()))
-
-
-def test_an_mcu_without_samples_is_driven_checked_and_the_log_says_what_is_missing() -> None:
-    world = World(config(counts=3200))
-    with world.mcu.no_sample():
-        world.run(0.3)
-        world.drive(0.5, seconds=1.0)
-        assert check_of(world) == "checked"
-        (text,) = texts(world, "link_check")
-        assert "does not send encoder counts" in text
-    assert world.state.mode == "driving"
 
 
 OLD_FIRMWARE = pytest.mark.parametrize(
@@ -123,44 +105,7 @@ def test_old_firmware_is_never_driven_on_a_checked_link_and_the_reason_names_the
     assert world.state.mode == "driving"
 
 
-# resets
-
-
-def test_a_reset_is_found_by_the_clock_when_its_announcement_is_lost() -> None:
-    world = started(config("on", 3200))
-    world.drive(0.5, seconds=1.0)
-    x = world.state.x
-    world.mcu.reset(world.now_ns, 30 * MS)
-    world.mcu._events.clear()  # neither noise nor identity gets through
-    world.hold(0.5, seconds=2.0)
-    assert any("its clock went back" in text for text in texts(world, "mcu_restarted"))
-    assert world.state.mode == "ready"
-    assert stopped(world)
-    assert world.state.x - x < 0.05
-
-
 # damage
-
-
-def test_a_burst_of_damaged_replies_stops_and_goes_on() -> None:
-    world = started(config("on", 3200))
-    world.drive(0.5, seconds=1.0)
-    sent = len(world.port.sent)
-    with world.mcu.noise(b"~"):
-        world.hold(0.5, seconds=0.08, hz=100.0)
-        assert world.state.link == "stale"
-        assert world.state.code == "replies_damaged"
-        world.hold(0.5, seconds=0.3)
-        late = [line for _, line in list(world.port.sent)[sent + 8 :]]
-        assert late
-        assert not moving(late)
-    world.hold(0.5, seconds=1.0)
-    assert world.state.mode == "driving"  # a short gap only ramps up again from rest
-    assert check_of(world) == "checked with samples"
-    assert world.state.counters["line_crc_error"] >= 5
-    world.send(0.0)
-    world.run(1.0)
-    assert off_by(world) < 0.001
 
 
 @pytest.mark.variations(3)
@@ -288,25 +233,3 @@ def test_an_echo_beside_a_board_is_never_driven(period: float, latency_ms: int) 
         world.drive(0.5, seconds=2.0)
         assert (world.state.link, world.state.code) == ("booting", "echo")
         assert moving([line for _, line in world.port.sent]) == []
-
-
-@pytest.mark.variations(4)
-@pytest.mark.parametrize("kind", [Echo, HalfDuplex])
-@pytest.mark.parametrize("acceleration", [1.0, 100.0])
-@pytest.mark.parametrize(("check", "counts"), [("off", 0), ("on", 0), ("on", 3200)])
-def test_an_echo_that_begins_during_a_drive_ends_the_link_when_the_speed_changes(
-    check: str, counts: int, acceleration: float, kind: type[FakeMcu]
-) -> None:
-    limits = replace(LimitsConfig(), linear_acceleration=acceleration)
-    world = World(replace(config(check, counts), limits=limits))
-    world.run(0.5)
-    world.drive(0.5, seconds=1.0)
-    assert world.state.mode == "driving"
-    world.mcu.__class__ = kind  # TX now touches RX
-    world.drive(-0.5, seconds=1.2)
-    assert world.state.link != "up"
-    assert world.state.code == "echo"
-    sent = len(world.port.sent)
-    world.drive(0.5, seconds=10.0)
-    assert world.state.code == "echo"
-    assert moving([line for _, line in list(world.port.sent)[sent:]]) == []

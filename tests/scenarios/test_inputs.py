@@ -2,12 +2,8 @@
 
 from __future__ import annotations
 
-import math
-
-import msgspec
 import pytest
 
-from tests.each import each
 from tests.scenarios.speakers import Speaker
 from tests.scenarios.world import World
 
@@ -19,32 +15,6 @@ def world() -> World:
     return world
 
 
-@each(
-    ("key", "payload", "reason"),
-    [
-        ("cmd/app", b"{", "malformed"),
-        ("cmd/stranger", b'{"linear":{"x":0.5},"angular":{}}', "unknown_source"),
-        (
-            "cmd/app",
-            msgspec.msgpack.encode({"linear": {"x": math.nan}, "angular": {}}),
-            "not_finite",
-        ),
-    ],
-)
-def test_a_bad_command_is_refused_as_a_whole_and_counted(
-    key: str, payload: bytes, reason: str
-) -> None:
-    world = World()
-    world.run(0.2)
-    world.drive(0.3, seconds=0.5)
-    world.run(0.2)
-    world.put(key, payload)
-    world.run(0.06)
-    assert world.state.counters[f"command_{reason}"] == 1
-    assert world.state.refused
-    assert world.state.mode == "ready"  # it extended nothing: the timeout has passed
-
-
 def test_stamps_that_zenoh_replaces_are_only_counted(world: World) -> None:
     client = Speaker(world, "signed", ahead=0.4)
     client.open()
@@ -53,12 +23,6 @@ def test_stamps_that_zenoh_replaces_are_only_counted(world: World) -> None:
     world.run(0.5)
     ahead.open()
     assert world.state.counters["stamps_replaced"] == 40
-
-
-def test_a_query_on_the_wildcard_calls_no_service(world: World) -> None:
-    for service in ("stop", "clear", "deactivate"):
-        assert world.ask(f"srv/{service}", asked="**") == []
-    assert world.state.mode == "ready"
 
 
 def test_state_is_published_ten_times_a_second_and_immediately_on_change(world: World) -> None:

@@ -79,24 +79,6 @@ def test_the_lower_of_a_speed_limit_and_a_setting_wins_in_either_order(
     assert max(speeds) == pytest.approx(0.3)
 
 
-@each(
-    "payload",
-    [b'{"speed_limit": -0.1}', b'{"speed_limit": 101, "percentage": true}', b"{}", b"\x00\x01",
-     b'{"speed_limit": 0.9, "more": 1}'],
-)  # fmt: skip
-def test_a_bad_message_is_counted_and_shown_and_leaves_the_limit_as_it_was(payload: bytes) -> None:
-    world = World()
-    world.run(0.2)
-    limit(world, 0.3)
-    before = sum(count for name, count in world.state.counters.items() if "command_" in name)
-    world.put("speed_limit", payload)
-    world.run(0.2)
-    counters = world.state.counters
-    assert sum(count for name, count in counters.items() if "command_" in name) == before + 1
-    assert world.state.refused.startswith("speed_limit: ")
-    assert world.state.speed_limit.startswith("0.3 m/s, ")
-
-
 def test_a_speed_limit_neither_moves_the_robot_nor_clears_a_stop(world: World) -> None:
     assert world.call("stop").success
     limit(world, 0.3)

@@ -111,28 +111,6 @@ def test_without_an_echo_a_constant_queue_from_the_first_command_on_cannot_be_se
     assert obeyed > 150
 
 
-def test_too_long_a_round_trip_is_named_with_its_length_and_the_setting() -> None:
-    world = quiet()
-    speaker = Speaker(world, "client")
-    over(world, speaker, lambda t: 0.41, lambda t: 0.0, 4.0)
-    assert waits_for(world) == "command"
-    messages = []
-    for _ in range(8):
-        messages.append(speaker.message(0.4))
-        world.run(0.05)
-    for _ in range(60):
-        speaker.deliver(messages.pop(0))
-        messages.append(speaker.message(0.4))
-        world.run(0.05)
-    assert waits_for(world) == "round_trip"
-    (text,) = [entry.waits_for for entry in world.state.sources if entry.name == "app"]
-    assert text == (
-        "the round trip to app takes 0.4 s, but its timeout allows at most 0.3 s; echo the newest "
-        "beat, not an old one; if the network is as slow, raise the timeout of the source in "
-        "commands.sources"
-    )
-
-
 @each("way", STAMPED)
 def test_a_sender_drives_on_as_soon_as_it_is_prompt_again(way: Way) -> None:
     world = quiet()
@@ -152,32 +130,6 @@ def test_a_sender_drives_on_as_soon_as_it_is_prompt_again(way: Way) -> None:
 # clocks that are set
 
 
-@pytest.mark.variations(3)
-@pytest.mark.parametrize(
-    ("way", "end"),
-    [*((way, "activate") for way in FOREIGN), ("signed", "new sender"), ("rmw", "new sender")],
-)
-def test_a_clock_that_was_set_back_is_named_until_activate_or_a_new_sender(
-    way: Way, end: str
-) -> None:
-    world = quiet()
-    speaker = Speaker(world, way)
-    speaker.open()
-    speaker.ahead -= 5.0
-    speaker.hold(0.4, 0.3)
-    since_ns = world.now_ns + NS_PER_S // 2
-    speaker.hold(0.4, 4.0)
-    assert waits_for(world) == "set_back"
-    speaker.hold(0.0, 2.0)
-    speaker.hold(0.4, 1.0)
-    assert not moved(world, since_ns)
-    if end == "activate":
-        world.call("activate")
-    else:
-        speaker.name = "b"
-    speaker.open()
-
-
 @pytest.mark.parametrize("way", FOREIGN)
 def test_a_clock_that_was_set_forwards_drives_again_after_one_timeout(way: Way) -> None:
     world = quiet()
@@ -187,37 +139,6 @@ def test_a_clock_that_was_set_forwards_drives_again_after_one_timeout(way: Way) 
     speaker.hold(0.4, 0.2)
     speaker.hold(0.4, 0.3)
     assert world.state.mode == "driving", world.state.reason
-
-
-STAMPS: dict[str, Callable[[float], float]] = {
-    "frozen": lambda t: 13.347,
-    "half speed": lambda t: 100 + 0.5 * t,
-    "seconds": lambda t: 100.0 + int(t),
-    "double speed": lambda t: 100 + 2.0 * t,
-    "a bag in a loop": lambda t: 100 + t % 1.5,
-}
-
-
-@pytest.mark.variations(3)
-@each("kind", list(STAMPS))
-@pytest.mark.parametrize("way", ["rmw", "header", "signed"])
-def test_stamps_that_are_no_times_are_named_and_never_drive_for_long(way: Way, kind: str) -> None:
-    """Without a word about stamps, `state` asked for a zero for ever, or called the sender new."""
-    world = quiet()
-    speaker, codes = Speaker(world, way), []
-    for step in range(200):
-        at = step * 0.05
-        message = speaker.message(0.0 if at < 1.5 else 0.3)
-        speaker.deliver(message._replace(stamp_ns=int(STAMPS[kind](at) * NS_PER_S)))
-        world.run(0.05)
-        if at > 4.5:
-            codes.append(waits_for(world))
-            assert world.state.mode == "ready"
-    assert set(codes) == {"stamps"} if kind != "a bag in a loop" else set(codes) <= {
-        "stamps", "set_back", "stale", "not_newer",
-    }  # fmt: skip
-    (text,) = [entry.waits_for for entry in world.state.sources if entry.name == "app"]
-    assert "use_sim_time" in text or kind == "a bag in a loop"
 
 
 # order

@@ -8,7 +8,6 @@ import pytest
 
 from acsard.core.config.named_faults import named
 from acsard.core.config.settings import Config, ControlConfig, McuConfig
-from acsard.core.simulator.fake_mcu import FakeMcu
 from tests.scenarios.world import World
 
 ZERO = b"ap00.00,bp00.00,cp00.00,dp00.00\r\n"
@@ -23,33 +22,6 @@ def world() -> World:
 
 def moving(lines: list[bytes]) -> list[bytes]:
     return [line for line in lines if line not in (ZERO, b"\r\n", b"?\r\n")]
-
-
-def test_unplugging_is_reported_immediately_and_commands_zero(world: World) -> None:
-    world.drive(0.5, seconds=1.0)
-    world.port.unplug()
-    world.run(0.01)
-    state = world.state
-    assert (state.mode, state.link) == ("waiting", "down")
-    assert state.code == "port_closed"
-    outputs = world.outputs
-    assert outputs is not None
-    assert outputs.speeds.as_tuple() == (0.0, 0.0, 0.0, 0.0)
-
-
-def test_after_replugging_nothing_moves_before_a_zero(world: World) -> None:
-    world.drive(0.5, seconds=1.0)
-    world.port.unplug()
-    world.hold(0.5, seconds=1.0)
-    fresh = FakeMcu(world.config, world.now_ns)
-    world.mcu = fresh
-    world.port.plug(fresh)
-    world.hold(0.5, seconds=2.0)
-    assert fresh.heard[0][1] == b"\r\n"
-    assert not moving(world.lines())
-    assert world.state.code == "neutral"
-    world.drive(0.5, seconds=0.5)
-    assert world.state.mode == "driving"
 
 
 @pytest.mark.slow
@@ -109,16 +81,6 @@ def test_an_mcu_that_speaks_unprompted_at_ten_hertz_can_drive() -> None:
         world.send(0.0)
         world.run(1.5)
     assert world.state.x == pytest.approx(2.0, rel=0.03)
-
-
-def test_a_comma_latched_mcu_keeps_its_last_wheel_without_the_trailing_comma(
-    world: World,
-) -> None:
-    with world.mcu.comma_latched():
-        world.drive(0.5, seconds=0.6)
-        assert world.mcu.vehicle.set_points == [10.0, 10.0, 10.0, 0.0]
-        world.hold(0.5, seconds=1.0)
-        assert "rear_right wheel is blocked, or has no power" in world.state.wheel_fault
 
 
 def test_the_trailing_comma_option_reaches_the_last_wheel_of_a_comma_latched_mcu() -> None:
@@ -185,36 +147,6 @@ def test_a_slow_wire_drives_at_the_rate_it_carries() -> None:
     assert world.state.counters.get("lines_superseded", 0) == 0
 
 
-def test_a_stall_of_the_loop_causes_no_burst_of_lines_and_loses_no_distance(world: World) -> None:
-    world.drive(0.5, seconds=1.0)
-    sent = len(world.port.sent)
-    world.send(0.5)
-    world.stall(0.08)
-    world.hold(0.5, seconds=0.5)
-    assert len(world.port.sent) - sent <= 52
-    world.send(0.0)
-    world.run(1.5)
-    assert world.state.x == pytest.approx(world.mcu.vehicle.pose.x, abs=0.005)
-
-
-def test_a_lost_link_is_reported_as_a_host_stall_or_as_a_silent_board(
-    world: World,
-) -> None:
-    world.drive(0.5, seconds=1.0)
-    with world.mcu.mute():
-        world.run(0.05)
-        world.stall(0.2)
-        world.run(0.05)
-        assert world.state.link == "stale"
-        assert world.state.code == "host_late"
-    assert world.state.counters["link_lost_host_stall"] == world.state.counters["link_lost"] == 1
-    world.hold(0.5, seconds=1.0)
-    with world.mcu.mute():
-        world.run(0.2)
-    assert world.state.counters["link_lost"] == 2
-    assert world.state.counters["link_lost_host_stall"] == 1
-
-
 @pytest.mark.variations(3)
 @pytest.mark.parametrize("stall", [0.105, 0.15, 0.22])
 def test_a_stall_of_this_computer_does_not_stop_the_robot_without_a_ramp(stall: float) -> None:
@@ -233,38 +165,3 @@ def test_a_stall_of_this_computer_does_not_stop_the_robot_without_a_ramp(stall: 
         world.stall(stall)
         world.hold(0.8, seconds=0.3)
         assert b"ap00.00" not in b"".join(line for _, line in list(world.port.sent)[lines:])
-
-
-@pytest.mark.slow
-@pytest.mark.variations(9)
-@pytest.mark.parametrize("fault", ["lost_replies", "lost_commands"])
-def test_a_link_that_loses_lines_is_reported_once(fault: str) -> None:
-    world = World()
-    with world.mcu.switched_on(named(fault)):
-        world.run(25.0)
-    events = [event for event in world.events if event.name == "lines_lost"]
-    assert [event.level for event in events] == ["warning"]
-    assert "answered only" in events[0].text
-
-
-@pytest.mark.parametrize(
-    ("fault", "code"),
-    [
-        ("mute", "received_nothing"),
-        ("noise", "received_foreign"),
-        ("partial_line", "received_cut"),
-    ],
-)
-def test_a_silent_or_garbled_board_is_diagnosed_by_the_received_bytes(
-    fault: str, code: str
-) -> None:
-    world = World(wanted={"state"})
-    with world.mcu.switched_on(named(fault)):
-        world.run(2.9)
-        assert world.state.code == "booting"
-        states = len(world.bus.published["state"])
-        world.run(6.5)
-    assert world.state.code == code
-    assert len(world.bus.published["state"]) - states < 80, "its figures are not news of their own"
-    (event,) = [event for event in world.events if event.code == code]
-    assert (event.name, event.level) == ("link_booting", "warning")

@@ -111,22 +111,6 @@ def counted(events: list[Event]) -> int:
     return sum(event.count for event in events)
 
 
-@pytest.mark.slow
-def test_refused_commands_are_one_log_line_a_second_that_counts_them_by_reason(
-    world: World,
-) -> None:
-    for step in range(500):
-        world.put("cmd/app" if step % 5 else "cmd/nobody", b'{"linear": {"x": 0.5}}')
-        world.send(0.1, source="stranger")
-        world.run(0.01)
-    world.run(1.1)
-    lines = events_named(world, "command_refused")
-    assert len(lines) <= 7
-    assert counted(lines) == 1000
-    assert "100 x unknown_source" in lines[2].text
-    assert "100 x wrong_shape" in lines[2].text
-
-
 # at the end
 
 

@@ -8,7 +8,6 @@ from pathlib import Path
 import pytest
 from msgspec.structs import replace
 
-from acsard.core.config.named_faults import FAULTS
 from acsard.core.config.settings import Config, RecordConfig
 from acsard.core.link.serial_output import Offered
 from acsard.core.robot import Robot
@@ -19,61 +18,14 @@ from acsard.recording.file import Head, Recording, listed
 from acsard.recording.recorder import Recorder
 from acsard.recording.replay import Playback, Replay
 from tests.scenarios.taped import (
-    INPUTS,
-    WITH_ARGUMENTS,
     Tape,
-    drive_through_faults,
     recorded_world,
     replayed,
 )
 from tests.scenarios.world import World
 
 PLAIN = Config()
-FULL = replace(
-    PLAIN,
-    mcu=replace(PLAIN.mcu, link_check="on", encoder_counts=3200),
-    odometry=replace(PLAIN.odometry, gyro=True),
-)
 SLOW_LIMITS = replace(PLAIN, limits=replace(PLAIN.limits, linear_speed=0.3))
-
-
-def taped(config: Config, seconds: float) -> Tape:
-    tape, world = recorded_world(config)
-    drive_through_faults(world, seconds)
-    return tape
-
-
-def lives_again(tape: Tape, config: Config, first: int = 0, least: int = 100) -> None:
-    comparison = replayed(tape, config, first).comparison
-    assert comparison.first is None
-    assert comparison.exact
-    assert comparison.steps == comparison.equal["modes"] == len(tape.taken) - first
-    steps = tape.taken[first:]
-    lines = sum(step.line is not None for step in steps)
-    assert comparison.all["lines"] == comparison.equal["lines"] == lines >= least
-    poses = sum(len(step.news.estimates) for step in steps)
-    assert comparison.all["poses"] == comparison.equal["poses"] == poses >= least
-    assert comparison.end is not None
-    assert comparison.end[0] == comparison.end[1]
-    assert comparison.max_distance_m == 0.0
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    "config",
-    [
-        pytest.param(PLAIN, id="plain", marks=pytest.mark.slow),
-        pytest.param(FULL, id="checked, counted, with a gyro"),
-    ],
-)
-def test_a_drive_through_every_fault_is_replayed_to_the_last_bit(config: Config) -> None:
-    tape, world = recorded_world(config)
-    # `test_emergency_stop.py` and `test_bumpers.py` replay the inputs.
-    assert {*drive_through_faults(world, 45.0)} == {*FAULTS, *WITH_ARGUMENTS} - INPUTS
-    for has in ("missed", "refusals", "requests", "port_trouble", "commands"):
-        assert any(getattr(step.heard, has) for step in tape.taken), has
-    assert any(step.line is not None and step.sent is None for step in tape.taken)
-    lives_again(tape, config)
 
 
 def test_a_replay_counts_lines_and_commands_as_the_daemon_did() -> None:

@@ -10,17 +10,13 @@ import pytest
 
 from acsard.core.config.parsing import parse
 from acsard.core.config.settings import Config, LimitsConfig
-from acsard.core.incoming.commands import Via
 from acsard.core.incoming.queries import Query
-from acsard.core.messages.cdr import Cdr
 from acsard.core.messages.schema import ServiceReply
 from acsard.core.messages.signature import public_name
-from acsard.core.ros import parameters as rcl
 from acsard.core.values import NS_PER_S, Instant, Plain
 from acsard.daemon.control_loop import Step
 from acsard.daemon.pacing import NO_PERIOD, Period
 from tests.each import each
-from tests.scenarios.speakers import Speaker, moved
 from tests.scenarios.world import World
 from tests.stepped import Outputs
 
@@ -94,13 +90,6 @@ def test_a_setting_is_in_config_and_in_the_log_with_its_client_and_old_value(
     assert (config(world).limits.linear_speed, config(world).rates.telemetry) == (0.8, 5.0)
 
 
-def test_a_refused_change_changes_nothing_and_says_why(world: World) -> None:
-    reply = sets(world, limits__angular_speed=1.0, limits__linear_deceleration=0.15)
-    assert not reply.success
-    assert config(world) == Config()
-    assert not [event for event in world.events if event.name == "set"]
-
-
 @pytest.mark.slow
 def test_the_wheel_speed_limit_changes_only_at_rest_and_the_guard_uses_it() -> None:
     world = World(Config(limits=LimitsConfig(linear_speed=3.0, wheel_speed=10.0)))
@@ -119,19 +108,6 @@ def test_the_wheel_speed_limit_changes_only_at_rest_and_the_guard_uses_it() -> N
     assert world.state.linear == pytest.approx(0.5, abs=0.05)
 
 
-@pytest.mark.slow
-def test_softer_braking_is_refused_until_the_robot_is_below_a_lowered_limit(
-    world: World,
-) -> None:
-    world.drive(1.0, seconds=2.0)
-    assert sets(world, limits__linear_speed=0.1).success
-    soft = {"limits__linear_deceleration": 0.05, "limits__linear_stop_deceleration": 0.05}
-    assert not sets(world, **soft).success
-    world.call("stop")
-    world.run(0.5)
-    assert world.state.linear == pytest.approx(0.0, abs=0.02)
-
-
 def test_a_new_timeout_requires_neutral_first_and_is_then_in_force(world: World) -> None:
     world.drive(0.3, seconds=0.5)
     assert not sets(world, commands__sources__app__timeout=0.6).success
@@ -147,51 +123,12 @@ def test_a_new_timeout_requires_neutral_first_and_is_then_in_force(world: World)
     assert world.state.mode == "ready"
 
 
-def test_a_sender_that_is_sending_is_not_forgotten_by_a_new_timeout(world: World) -> None:
-    stuck = Speaker(world, "plain")
-    stuck.open()
-    for verb in ("stop", "clear"):
-        stuck.hold(0.5, 1.0)
-        assert world.call(verb).success
-    stuck.hold(0.5, 0.5)
-    assert sets(world, commands__sources__app__timeout=0.5).success
-    since_ns = world.now_ns
-    Speaker(world, "plain").send(0.0)
-    stuck.hold(0.5, 1.0)
-    assert not moved(world, since_ns)
-    assert world.state.code == "neutral"
-
-
 def test_a_rate_is_in_force_from_the_next_message_on(world: World) -> None:
     assert sets(world, rates__odom=10.0).success
     world.bus.wanted_keys.add("odom")
     world.run(2.0)
     messages = world.bus.published["odom"]
     assert 19 <= len(messages) <= 21
-
-
-@pytest.mark.parametrize("via", ["bridge"])
-@pytest.mark.parametrize("service", rcl.SETTING_SERVICES)
-def test_ros_parameters_change_the_same_settings(world: World, service: str, via: Via) -> None:
-    def ask(name: str, value: float) -> rcl.SetParametersResult:
-        wish = rcl.Parameter(name, rcl.ParameterValue(rcl.DOUBLE, double_value=value))
-        payload = Cdr(rcl.SetRequest).encode(rcl.SetRequest([wish]))
-        key, ticket = f"parameters/{service}", world.now_ns
-        world.bus.queries.append(Query(ticket, key, key, "", payload, "", world.now_ns, via))
-        world.run(0.03)
-        (reply,) = world.bus.replies[ticket]
-        if service == "set_parameters":
-            return Cdr(rcl.SetReply).decode(reply.payload).results[0]
-        return Cdr(rcl.SetAtomicallyReply).decode(reply.payload).result
-
-    assert ask("limits.linear_speed", 0.7).successful
-    assert config(world).limits.linear_speed == 0.7
-    (event,) = [event for event in world.events if event.name == "set"]
-    assert (event.text, event.by) == ("limits.linear_speed = 0.7 (was 1.0)", "unnamed (bridge)")
-    refused = ask("limits.linear_speed", 70.0)
-    assert (refused.successful, "from 0 to 10 m/s" in refused.reason) == (False, True)
-    assert not ask("drive.wheel_radius", 0.07).successful
-    assert config(world).limits.linear_speed == 0.7
 
 
 def calls_of_longest_step(world: World, service: str, payload: bytes) -> int:

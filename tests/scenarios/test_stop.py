@@ -40,14 +40,6 @@ def test_a_stop_latches_until_clear_and_then_requires_neutral(world: World) -> N
     assert world.state.mode == "driving"
 
 
-def test_a_put_on_stop_stops_the_robot_with_any_payload(world: World) -> None:
-    for payload in (b"", b"\x00", b"{}", b"please"):
-        world.put("stop", payload)
-        world.run(0.02)
-        assert world.state.mode == "stopped"
-        world.call("clear")
-
-
 def test_a_delete_on_stop_is_not_a_stop(world: World) -> None:
     world.put("stop", b"", put=False)
     world.run(0.02)
@@ -195,19 +187,6 @@ def test_the_state_shows_each_cause(world: World) -> None:
     assert second.age is not None
     assert first.age == pytest.approx(1.5, abs=0.1)
     assert second.age == pytest.approx(0.3, abs=0.25)
-
-
-def test_a_flood_of_stops_hides_neither_the_first_client_nor_the_last(world: World) -> None:
-    for name in range(60):
-        call(world, "stop", f"client{name}")
-    first, last = public_name("client0"), public_name("client59")
-    names = [cause.by for cause in world.state.causes]
-    assert len(names) == 32
-    assert (names[0], names[-1]) == (f"{first} (native)", f"{last} (native)")
-    shown = world.numbers
-    call(world, "stop", "joe")
-    call(world, "clear", "ann", shown)
-    assert [cause.by for cause in world.state.causes] == [f"{JOE} (native)"]
 
 
 # a stop and a fault

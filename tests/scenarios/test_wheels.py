@@ -53,18 +53,6 @@ def test_a_faulty_encoder_stops_the_robot_and_is_named(world: World, wheel: int,
     assert world.state.mode == "driving"
 
 
-def test_repeated_impossible_lines_are_a_fault_within_thirty_milliseconds(world: World) -> None:
-    world.drive(0.5, seconds=1.0)
-    x = world.state.x
-    with world.mcu.bias(3, 9.0):
-        world.hold(0.5, seconds=0.05, hz=20.0)
-        assert world.state.mode == "fault"
-        assert "rear_right" in world.state.reason
-        world.run(1.0)
-    assert stopped(world)
-    assert world.state.x == pytest.approx(x, abs=0.2)
-
-
 @pytest.mark.parametrize("speeds_up", [False, True])
 def test_wheels_with_few_counts_are_a_fault_only_if_they_are_too_fast(speeds_up: bool) -> None:
     """The board is asked as often as possible without its counts."""

@@ -7,33 +7,15 @@ from typing import get_args
 
 import pytest
 
-from acsard.core.config.settings import CommandsConfig, Config, Source
 from acsard.core.values import NS_PER_S
-from tests.each import each
-from tests.scenarios.speakers import SHARED, Speaker, Way, moved
+from tests.scenarios.speakers import Speaker, Way, moved
 from tests.scenarios.world import World
-
-OWN: tuple[Way, ...] = ("client", "signed", "rmw")
 
 
 def quiet() -> World:
     world = World()
     world.run(0.3)
     return world
-
-
-def cleared(way: Way, *names: str) -> tuple[World, list[Speaker]]:
-    """Return a world after `stop` and `clear`, and senders whose delays the daemon has proved."""
-    world = quiet()
-    speakers = [Speaker(world, way, name) for name in names]
-    for speaker in speakers:
-        speaker.open()
-        world.run(1.2)
-    world.call("stop")
-    world.run(2.1)
-    assert world.call("clear").success
-    world.run(0.1)
-    return world, speakers
 
 
 @pytest.mark.slow
@@ -57,47 +39,6 @@ def test_the_zeros_of_one_program_never_arm_another(way: Way) -> None:
             (zeros, speeds)[number].send((0.0, 0.5)[number])
             due[number] += 1 / (zero_hz, speed_hz)[number] * dice.uniform(0.9, 1.1)
         assert not moved(world, start_ns), seed
-
-
-@pytest.mark.slow
-@each("way", OWN)
-def test_a_zero_of_an_unshared_identity_arms_immediately_even_right_after_speeds(way: Way) -> None:
-    world, (speaker,) = cleared(way, "a")
-    speaker.hold(0.4, 1.0)
-    assert world.state.mode == "ready"
-    speaker.hold(0.0, 0.05)
-    speaker.hold(0.4, 0.1)
-    assert world.state.mode == "driving"
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("way", SHARED)
-def test_a_zero_of_a_shared_identity_arms_when_no_speed_has_followed_for_a_second(way: Way) -> None:
-    world, (speaker,) = cleared(way, "a")
-    speaker.hold(0.4, 1.0)
-    for quiet_s, mode in ((0.9, "ready"), (1.0, "driving")):
-        speaker.send(0.0)
-        world.run(quiet_s)
-        speaker.hold(0.4, 0.2)
-        assert world.state.mode == mode
-
-
-@pytest.mark.variations(8)
-@pytest.mark.parametrize("way", get_args(Way))
-def test_a_sender_that_was_silent_for_ten_seconds_must_send_a_zero_again(way: Way) -> None:
-    """The first speed after an hour of silence moved the robot by 1.16 m in 3 s."""
-    world = quiet()
-    speaker = Speaker(world, way)
-    speaker.open()
-    world.run(10.5)
-    since_ns = world.now_ns
-    speaker.hold(0.4, 2.0)
-    assert not moved(world, since_ns)
-    assert world.state.code == "neutral"
-    speaker.send(0.0)
-    world.run(1.1)
-    speaker.hold(0.4, 0.3)
-    assert world.state.mode == "driving"
 
 
 def test_two_programs_with_a_gid_of_zeros_never_arm_each_other() -> None:
@@ -124,17 +65,6 @@ def navigating(way: Way, name: str = "nav2") -> tuple[World, Speaker]:
     speaker = Speaker(world, way, name)
     speaker.key = "cmd/nav"
     return world, speaker
-
-
-@pytest.mark.variations(8)
-@pytest.mark.parametrize("way", get_args(Way))
-def test_where_a_pause_arms_every_goal_drives_without_a_zero(way: Way) -> None:
-    world, nav = navigating(way)
-    for pause in (1.1, 12.0, 0.0):
-        nav.hold(0.4, 1.0)
-        assert world.state.mode == "driving", world.state.reason
-        nav.hold(0.0, 0.3)
-        world.run(pause)
 
 
 @pytest.mark.variations(3)
@@ -199,20 +129,6 @@ def test_the_higher_priority_takes_the_robot_and_gives_it_back() -> None:
     assert "teleop has priority" in waits_for(world, "nav")
     world.hold(0.2, seconds=1.0, source="nav")
     assert (world.state.source, world.odom.twist.twist.linear.x > 0) == ("nav", True)
-
-
-def test_at_equal_priority_the_first_keeps_the_robot() -> None:
-    pair = (Source("left", 50), Source("right", 50))
-    world = World(Config(commands=CommandsConfig(sources=pair)))
-    world.run(0.2)
-    world.drive(0.3, seconds=0.2, source="right")
-    world.send(0.0, source="left")
-    for _ in range(10):
-        world.send(-0.3, source="left")
-        world.send(0.3, source="right")
-        world.run(0.05)
-    assert world.state.source == "right"
-    assert "came first" in waits_for(world, "left")
 
 
 @pytest.mark.parametrize("way", ["client", "signed", "rmw"])
