@@ -77,8 +77,8 @@ class DdsDomain:
     def __init__(self, program: str, where: Path) -> None:
         self._program, self._where = program, where
         self.number, self._claim = _unused_domain()
-        self.cyclone = where / f"cyclone{self.number}.xml"
-        self.cyclone.write_text(CYCLONE)
+        self._cyclone = where / f"cyclone{self.number}.xml"
+        self._cyclone.write_text(CYCLONE)
         self._domain = Domain(self.number, CYCLONE)
 
     def __enter__(self) -> DdsDomain:
@@ -88,21 +88,16 @@ class DdsDomain:
         _delete(self._domain)
         self._claim.close()
 
-    @property
-    def environment(self) -> dict[str, str]:
-        """The environment of a shell for this domain, without any other ROS settings."""
-        own = {"CYCLONEDDS_URI": f"file://{self.cyclone}", "ROS_DISTRO": "jazzy"}
-        return bare_environment() | own
-
-    def node(self, namespace: str = "", name: str = "tester") -> DdsNode:
+    def node(self) -> DdsNode:
         """Return a node, which joins the domain when it is entered."""
-        return DdsNode(self.number, namespace, name)
+        return DdsNode(self.number)
 
-    def bridge(self, endpoint: str, *more: str, file: Path = BRIDGE_FILE) -> Bridge:
-        """Return a bridge that connects to the Zenoh address `endpoint`, with options `more`."""
+    def bridge(self, endpoint: str) -> Bridge:
+        """Return a bridge that connects to the Zenoh address `endpoint`."""
         domain = str(self.number)
-        words = [self._program, "-c", str(file), "-e", endpoint, "-d", domain, *more]
-        env = self.environment | {"RUST_LOG": "zenoh_plugin_ros2dds=debug"}
+        words = [self._program, "-c", str(BRIDGE_FILE), "-e", endpoint, "-d", domain]
+        own = {"CYCLONEDDS_URI": f"file://{self._cyclone}", "ROS_DISTRO": "jazzy"}
+        env = bare_environment() | own | {"RUST_LOG": "zenoh_plugin_ros2dds=debug"}
         return Bridge(words, self._where, env)
 
 
@@ -182,9 +177,8 @@ class DdsNode(Client):
 
     PAUSE_S = 0.05
 
-    def __init__(self, domain: int, namespace: str = "", name: str = "tester") -> None:
-        super().__init__(namespace)
-        self.name = name
+    def __init__(self, domain: int) -> None:
+        super().__init__()
         self._participant = DomainParticipant(domain)
         self._graph = DataWriter(
             self._participant,
@@ -211,20 +205,13 @@ class DdsNode(Client):
         _delete(self._participant)
         assert not self._failed, self._failed
 
-    def publisher(self, name: str, type_name: str) -> DataWriter[Any]:
-        """Return the node's publisher of this topic. The first call creates it."""
-        if name not in self._publishers:
-            self._publishers[name] = self._writer(
-                f"rt/{self.full(name)}", idl(type_name), type_name
-            )
-            self._announce()
-        return self._publishers[name]
-
     def put(self, name: str, type_name: str, payload: bytes) -> None:
-        new = name not in self._publishers
-        publisher = self.publisher(name, type_name)
-        if new:
+        if name not in self._publishers:
+            publisher = self._writer(f"rt/{name}", idl(type_name), type_name)
+            self._publishers[name] = publisher
+            self._announce()
             until(publisher.get_matched_subscriptions, ROUTE_S, f"a route from {name}")
+        publisher = self._publishers[name]
         publisher.write(publisher.data_type.deserialize(payload))
 
     @contextmanager
@@ -241,7 +228,7 @@ class DdsNode(Client):
     @contextmanager
     def _follow(self, name: str, type_name: str, policies: Sequence[Any]) -> Iterator[Samples]:
         samples = Samples()
-        reader = self._reader(f"rt/{self.full(name)}", idl(type_name), policies)
+        reader = self._reader(f"rt/{name}", idl(type_name), policies)
         following = (reader, samples)
         self._following.append(following)
         self._announce()
@@ -255,7 +242,7 @@ class DdsNode(Client):
 
     def call(self, name: str, type_name: str = TRIGGER, payload: bytes = EMPTY_REQUEST) -> Called:
         if name not in self._clients:
-            self._clients[name] = _ServiceClient(self, self.full(name), type_name)
+            self._clients[name] = _ServiceClient(self, name, type_name)
         return self._clients[name].call(payload, next(self._numbers))
 
     def _take_all(self) -> None:
@@ -295,8 +282,8 @@ class DdsNode(Client):
         )
         node = make(
             "rmw_dds_common/msg/NodeEntitiesInfo",
-            node_namespace=f"/{self.namespace}",
-            node_name=self.name,
+            node_namespace="/",
+            node_name="tester",
             reader_gid_seq=readers,
             writer_gid_seq=writers,
         )

@@ -1,8 +1,7 @@
 """Replacements for rclpy and geometry_msgs, which need ROS, with the parts that `drive.py` uses.
 
 As in the real rclpy, a signal shuts the context down by default, even while a node publishes. The
-messages go to a real daemon in the protocol of rmw_zenoh or of a bridge, or over DDS to a real
-bridge.
+messages go to a real daemon in the protocol of rmw_zenoh or of a bridge.
 """
 
 from __future__ import annotations
@@ -16,19 +15,6 @@ import zenoh
 from rclpy.signals import SignalHandlerOptions
 from tests.system.harness import client_config
 from tests.system.ros_clients import TWIST, BridgeHalf, RmwClient, twist
-
-class OverDds:
-    def __init__(self, topic):
-        from tests.system.dds import DdsNode
-        self.node = DdsNode(int(os.environ["DOMAIN"])).__enter__()
-        self.topic = topic
-        self.publisher = self.node.publisher(topic, TWIST)
-
-    def get_subscription_count(self):
-        return len(self.publisher.get_matched_subscriptions())
-
-    def publish(self, message):
-        self.node.put(self.topic, TWIST, twist(message.linear.x, message.angular.z))
 
 class Publisher:
     def __init__(self, topic):
@@ -49,7 +35,7 @@ class Publisher:
 class Node:
     def create_publisher(self, kind, topic, depth):
         assert kind.__name__ == "Twist"
-        return OverDds(topic) if os.environ["WAY"] == "dds" else Publisher(topic)
+        return Publisher(topic)
 
 valid = False
 

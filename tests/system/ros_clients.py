@@ -681,13 +681,6 @@ def follow(topic, type_name, qos=None):
         topic, type_name, lambda message: last.__setitem__(topic, message), qos=qos,
         **definition(type_name), **router)
 
-def newest(topic):
-    last.pop(topic, None)
-    end = time.monotonic() + 5
-    while topic not in last and time.monotonic() < end:
-        time.sleep(0.005)
-    return last.get(topic)
-
 def message(type_name, **fields):
     cls = manager.store.types[type_name]
     return cls(**fields)
@@ -745,7 +738,7 @@ def nodes(topic):
     return info and [(p.node_namespace, p.node_name, p.qos) for p in info.publishers]
 
 print("ready", flush=True)
-verbs = {f.__name__: f for f in (follow, newest, drive, call, topics, services, nodes)}
+verbs = {f.__name__: f for f in (follow, drive, call, topics, services, nodes)}
 for line in sys.stdin:
     number, verb, args, kwargs = json.loads(line)
     try:

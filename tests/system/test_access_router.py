@@ -13,7 +13,6 @@ from collections.abc import Iterator
 import pytest
 import zenoh
 
-from acsard.client import connect
 from acsard.core.config.contradictions import warnings
 from acsard.core.config.parsing import parse
 from tests.permissions import FORGED, TWIST
@@ -29,21 +28,6 @@ ONE, TWO = "acsard/robot1", "acsard/robot2"
 def fleet(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Fleet]:
     with Fleet(tmp_path_factory.mktemp("fleet")) as fleet:
         yield fleet
-
-
-def test_the_python_client_drives_through_the_router_under_its_certificate_s_name(
-    fleet: Fleet,
-) -> None:
-    tls = str(fleet.where / "operator")
-    with (
-        fleet.member("viewer") as viewer,
-        viewer.follow("state") as states,
-        connect(fleet.endpoint, robot_id="robot1", tls=tls) as robot,
-    ):
-        robot.drive(0.2, seconds=0.3)
-        driven = {e.value["sender"] for e in states.seen if e.value["mode"] == "driving"} - {""}
-        assert driven == {robot._connection.sender}
-        assert robot._connection.sender.endswith(" [operator]")
 
 
 def test_a_robots_certificate_serves_its_own_tree_only(fleet: Fleet) -> None:

@@ -11,14 +11,10 @@ from acsard.client import connect
 from acsard.core.values import ROLES
 from tests.system.harness import (
     Bus,
-    Program,
-    acsard,
-    free_endpoint,
     until,
 )
 from tests.system.identities import Gated, Identity
 from tests.system.terminals import SCREEN, at_terminal
-from tests.system.viewer import Viewer
 
 pytestmark = pytest.mark.network
 
@@ -62,19 +58,6 @@ def test_doctor_reports_an_unlisted_certificate(robot: Gated) -> None:
     ended = robot.tool("unlisted", "doctor")
     assert ended.code == 1
     assert SILENCE in ended.out
-
-
-def test_foxglove_with_a_viewer_s_certificate_shows_and_stops_the_robot(robot: Gated) -> None:
-    port = int(free_endpoint().rpartition(":")[2])
-    words = ["foxglove", "--address", f"127.0.0.1:{port}", "--connect", robot.tls]
-    where = robot.daemon.config.parent
-    with Program(acsard(*words, "--tls", robot.own("viewer")), where) as program:
-        program.says("ws://")
-        with Viewer(port) as viewer:
-            viewer.show("/odom").first()
-            assert viewer.call("/acsard/stop", {})["success"]
-    with Bus(robot.plain) as bus:
-        assert bus.get("srv/clear")["success"]
 
 
 @pytest.mark.slow

@@ -97,27 +97,6 @@ def begun(terminal: Terminal, program: Program, bus: Bus, starts: int = 1) -> in
     return starts
 
 
-def ends(terminal: Terminal, program: Program, starts: int, why: str) -> None:
-    """Wait until the program ends with exit code 1, at the latest by `q` after this reason.
-
-    If a busy machine has disturbed the leg, the leg is started again. `starts` is the number of
-    starts so far.
-    """
-
-    def ended() -> bool:
-        nonlocal starts
-        if (
-            asked := screen_text(terminal).count(STARTS)
-        ) > starts and program.process.poll() is None:
-            assert "has ended early" in screen_text(terminal)
-            terminal.press("q" if why in screen_text(terminal) else "\n")
-            starts = asked
-        return program.process.poll() is not None
-
-    until(ended, 10.0, "the leg ends")
-    assert program.ended(5.0) == 1, terminal.screen
-
-
 def screen_text(terminal: Terminal) -> str:
     """Return the whole screen as one line."""
     return " ".join(terminal.screen.split())
@@ -143,32 +122,6 @@ def test_space_stops_a_leg_within_the_ramp_which_may_then_be_repeated(
             terminal.press("q")
             assert program.ended(5.0) == 1, terminal.screen
         assert daemon.config.read_bytes() == before
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    "how",
-    ["stop", *(pytest.param(how, marks=pytest.mark.nightly) for how in ("teleop", "interrupt"))],
-)
-def test_the_reason_that_ended_a_leg_is_reported(tmp_path: Path, how: str) -> None:
-    with (
-        running(tmp_path, config=SKIDDING) as (daemon, bus),
-        calibrating(daemon) as (terminal, program),
-    ):
-        starts = begun(terminal, program, bus)
-        if how == "stop":
-            bus.put("stop", {})
-            why = "stopped by"
-        elif how == "teleop":
-            why = "teleop has priority"
-            with bus.commanding(0.0, source="teleop"):
-                ends(terminal, program, starts, why)
-        else:
-            terminal.press("\x03")
-            why = "the operator ended the drive"
-        ends(terminal, program, starts, why)
-        until(lambda: not any(bus.state()["wheels"]), 5.0, "at rest")
-        assert why in terminal.screen
 
 
 @pytest.mark.slow

@@ -23,7 +23,6 @@ from aiohttp import web
 from aiohttp.test_utils import TestServer
 
 from tests.pages import blocks
-from tests.system.browser import Page
 from tests.system.builds import CLIENTS, copied, node_program, program, run
 from tests.system.harness import (
     Bus,
@@ -68,22 +67,6 @@ def test_the_python_example_follows_the_robot(shared: Daemon, bus: Bus, tmp_path
     followed(words, tmp_path, bus)
 
 
-def driven(words: Sequence[str], where: Path, bus: Bus, **more: str) -> None:
-    """Check that the program drives the robot and prints the positions, then ends by itself."""
-    begun = bus.state()["x"]
-    with Program(words, where, environment(**more)) as driver:
-        until(lambda: bus.state()["source"] == "app", 30.0, f"it drives\n{driver}")
-        assert driver.ended(20.0) == 0, driver
-        results = [LINE.fullmatch(line) for line in driver.out]
-    matches = [match for match in results if match]
-    assert len(matches) > 20, driver
-    assert len(matches) == len(results), driver
-    assert float(matches[-1][1]) - begun == pytest.approx(bus.state()["x"] - begun, abs=0.01)
-    assert 0.2 < float(matches[-1][1]) - begun < 0.6
-    assert 0.15 < max(float(match[3]) for match in matches) < 0.25
-    bus.at_rest()
-
-
 @pytest.mark.slow
 async def test_the_node_program_says_why_the_page_closed_its_connection(tmp_path: Path) -> None:
     async def closes(request: web.Request) -> web.WebSocketResponse:
@@ -104,15 +87,6 @@ async def test_the_node_program_says_why_the_page_closed_its_connection(tmp_path
         out, err = await node.communicate()
     assert node.returncode == 1, (out, err)
     assert f"no connection to {address}: the token has expired\n" in err.decode()
-
-
-@pytest.mark.slow
-@pytest.mark.nightly
-def test_the_node_program_drives_the_robot_from_another_host(
-    page: Page, standing: Bus, tmp_path: Path
-) -> None:
-    words = [*node_program(tmp_path), page.away, page.invite("operator", "node")]
-    driven(words, tmp_path, standing, NODE_EXTRA_CA_CERTS=str(page.tls / "ca.pem"))
 
 
 @pytest.mark.parametrize("verb", ["state", "stop"])
@@ -247,52 +221,6 @@ def judged(words: Sequence[str], where: Path, messages: list[Said]) -> list[str]
     )
     assert done.returncode == 0, f"{words}\n{done.stdout}\n{done.stderr}"
     return done.stdout.splitlines()
-
-
-READER_TS = """
-import { createInterface } from "node:readline";
-import { Convert, RobotState } from "./acsard.js";
-
-// Neither more nor fewer modes, or it does not compile.
-const moves: Record<RobotState["mode"], boolean> = {
-  inactive: false, waiting: false, ready: false, driving: true, stopped: false, fault: false,
-  shutdown: true,
-};
-const readers = Convert as unknown as Record<string, (text: string) => unknown>;
-for await (const line of createInterface({ input: process.stdin })) {
-  const [kind, value] = JSON.parse(line);
-  try {
-    const message = readers["to" + kind](JSON.stringify(value));
-    if (kind === "RobotState" && typeof moves[(message as RobotState).mode] !== "boolean") throw 1;
-    console.log(kind, "read");
-  } catch {
-    console.log(kind, "refused");
-  }
-}
-"""
-
-
-@pytest.mark.languages
-@pytest.mark.timeout(600)
-def test_types_made_by_quicktype_compile_and_parse_the_daemon_s_messages(
-    schemas: Path, heard: list[Said], kept: Path, npm: str
-) -> None:
-    here = kept / "types"
-    here.mkdir(exist_ok=True)
-    (here / "package.json").write_text('{"private": true, "type": "module"}')
-    run([npm, "install", "--no-save", "quicktype@26", "typescript@5", "@types/node@20"], here)
-    shutil.copytree(schemas, here / "schemas", dirs_exist_ok=True)
-    (line,) = (line for line in commands() if line.startswith("npx quicktype "))
-    run(["sh", "-c", line.replace("npx", "npx --no-install", 1)], here)
-    tsc = ["npx", "--no-install", "tsc", "--strict", "--target", "es2022", "--module", "nodenext"]
-    (here / "reader.ts").write_text(READER_TS)
-    run([*tsc, "reader.ts"], here)
-    kinds, lies = [kind for kind, _ in heard], wrong(heard)
-    results = judged(["node", "reader.js"], here, heard + lies)
-    assert results == [f"{kind} read" for kind in kinds] + [f"{kind} refused" for kind, _ in lies]
-    (here / "reader.ts").write_text(READER_TS.replace("ready:", "idle:"))
-    with pytest.raises(AssertionError, match="idle"):
-        run([*tsc, "reader.ts"], here)
 
 
 READER_PY = """

@@ -22,7 +22,6 @@ from tests.system.harness import (
     acsard,
     environment,
     free_endpoint,
-    until,
 )
 
 pytestmark = pytest.mark.network
@@ -169,31 +168,6 @@ def test_doctor_does_not_check_the_local_port_for_a_daemon_on_another_machine(
     assert "runs on another machine" in findings["daemon"][-1]["text"]
     assert "port" not in findings
     assert [finding["level"] for finding in findings["configuration"]] == ["ok"]
-
-
-@pytest.mark.nightly
-@pytest.mark.parametrize(
-    ("fault", "words"),
-    [("mute", "nothing was received"), ("lost_replies", "does not answer each line")],
-)
-def test_doctor_reports_the_faulty_board_of_a_running_daemon(
-    tmp_path: Path, fault: str, words: str
-) -> None:
-    with Program(acsard("sim", "--fault", fault), tmp_path) as sim:
-        port = sim.says("acsard run --port").split()[-1]
-        with Daemon(tmp_path, words=("--port", port)) as daemon, Bus(daemon.endpoint) as bus:
-            linked = fault.startswith("lost")
-            until(lambda: bus.state()["mode"] == "ready" if linked else "received" in
-                  bus.state()["reason"], 10.0, "the diagnosis")  # fmt: skip
-            if linked:
-                until(lambda: any(e["name"] == "lines_lost" for e in bus.get("events")["events"]),
-                      30.0, "the comparison of the lines")  # fmt: skip
-            code, findings = examined(tmp_path, f'[bus]\nlisten = ["{daemon.endpoint}"]\n')
-    finding = worst(findings["serial link"])
-    assert words in finding["text"]
-    assert f"acsard mcu check --port {port}" in finding["mend"]
-    assert finding["level"] == ("warning" if linked else "failure")
-    assert code == 1 or linked
 
 
 def test_ports_lists_the_serial_ports_or_refers_to_dmesg() -> None:

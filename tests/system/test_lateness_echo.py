@@ -8,13 +8,11 @@ import sys
 import threading
 import time
 from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from pathlib import Path
 
 import pytest
 
-from acsard.client import connect
 from tests.system.bystander import lost
 from tests.system.harness import Bus, Daemon, Program, until
 
@@ -108,11 +106,6 @@ def delay(shared: Daemon) -> Iterator[Delay]:
         yield delay
 
 
-def waits(bus: Bus) -> list[str]:
-    """Return the codes of what the sources wait for."""
-    return [entry["wait"] for entry in bus.state()["sources"]]
-
-
 def joystick(delay: Delay, where: Path, seconds: int, held: int) -> Program:
     words = [sys.executable, "-c", JOYSTICK, delay.endpoint, str(seconds), str(held)]
     return Program(words, where)
@@ -135,41 +128,6 @@ def test_a_new_client_drives_within_0_3_s_of_its_zero(
     print(f"drives {moved - began:.3f} s after its zero")
     assert moved - began < 0.3 + lost(began, moved)
     bus.at_rest()
-
-
-def test_a_clear_does_not_release_a_stop_that_came_after_it(
-    shared: Daemon, bus: Bus, delay: Delay
-) -> None:
-    """The client's calls need a second to the daemon. Meanwhile another person stops the robot."""
-    with connect(shared.endpoint) as other, connect(delay.endpoint) as robot:
-        other.stop()
-        time.sleep(0.2)  # the state shows it
-        delay.seconds = 1.0
-        with ThreadPoolExecutor(1) as thread:
-            clearing = thread.submit(robot.clear)
-            time.sleep(0.3)
-            later = bus.get("srv/stop")["data"]["numbers"]
-            reply = clearing.result()
-        delay.seconds = 0.0
-    assert reply.success, reply
-    state = bus.state()
-    assert (state["mode"], [cause["number"] for cause in state["causes"]]) == ("stopped", later)
-    bus.get("srv/clear")
-
-
-def test_a_joystick_behind_a_queue_from_its_first_command_on_moves_nothing(
-    bus: Bus, delay: Delay, tmp_path: Path
-) -> None:
-    begun = bus.at_rest()
-    with joystick(delay, tmp_path, 3, 2) as program:
-        program.says("connected", 20.0)
-        delay.seconds = QUEUE_S
-        (tmp_path / "begin").touch()
-        until(lambda: bus.count("command_too_old") > 0, 10.0, "the first one comes, too late")
-        until(lambda: "round_trip" in waits(bus), 5.0, "why it does not drive")
-        assert program.ended(20.0) == 0, program
-    ended = bus.at_rest()
-    assert abs(ended["x"] - begun["x"]) < 1e-3
 
 
 @pytest.mark.parametrize("fault", ["a queue", "a partition that heals"])

@@ -4,11 +4,8 @@ from __future__ import annotations
 
 import array
 import asyncio
-import errno
 import fcntl
-import itertools
 import os
-import termios
 import threading
 import time
 import tty
@@ -155,38 +152,6 @@ async def test_a_line_sent_right_after_the_device_hung_up_is_lost_without_an_err
     assert errors == []
 
 
-@pytest.mark.parametrize("name", ["tcgetattr", "tcsetattr", "tcflush"])
-async def test_a_device_that_vanishes_while_it_is_opened_is_opened_later(
-    line: Line, monkeypatch: pytest.MonkeyPatch, name: str
-) -> None:
-    """Let each terminal call of the opening fail once, one further call in each attempt.
-
-    The port tries again after each failure until an attempt succeeds.
-    """
-    real, attempts, event_names = getattr(termios, name), itertools.count(1), list[str]()
-    left = 1
-
-    def vanishing(*arguments: object) -> object:
-        nonlocal left
-        left -= 1
-        if not left:
-            left = next(attempts) + 1
-            raise termios.error(errno.EIO, "Input/output error")
-        return real(*arguments)
-
-    with monkeypatch.context() as patch:
-        patch.setattr(termios, name, vanishing)
-        async with line.port(lambda event: event_names.append(event.name)) as port:
-            keeper = asyncio.create_task(port.keep_open())
-            deadline_ns = clock.mono_ns() + 10 * 10**9
-            while not port.is_open and not keeper.done() and clock.mono_ns() < deadline_ns:
-                await asyncio.sleep(0.01)
-            assert port.is_open
-            assert (event_names[0], event_names[-1]) == ("port_waiting", "port_open")
-            keeper.cancel()
-            await asyncio.wait([keeper])
-
-
 async def test_a_released_port_is_closed_with_zeros_and_opened_again(line: Line) -> None:
     async with line.port() as port:
         keeper = asyncio.create_task(port.keep_open())
@@ -194,7 +159,6 @@ async def test_a_released_port_is_closed_with_zeros_and_opened_again(line: Line)
         port.release(True)
         await asyncio.sleep(0.5)
         assert (port.is_open, port.opened, port.offer(STOP, clock.now())) == (False, 1, "down")
-        assert "srv/activate" in port.trouble
         other = open_raw(line.path, 115200)
         port.release(False)
         await asyncio.sleep(0.3)

@@ -18,12 +18,8 @@ from tests.system.harness import (
     ZERO_LINE,
     Bus,
     Daemon,
-    Following,
     Peer,
-    ReceivedMessage,
     Tables,
-    plain_reply,
-    silence,
     twist,
     until,
     wheels,
@@ -130,54 +126,3 @@ def test_a_trailing_comma_and_wired_signs_and_letters_apply_on_the_wire(
     assert first == b"\r\n"
     assert wheels(lines[0]) == STANDING
     assert {(line[-3:], len(line)) for line in lines} == {(b",\r\n", 34)}
-
-
-@pytest.mark.slow
-def test_a_silent_board_is_reported_gets_only_zeros_and_drives_on_after_a_short_gap(
-    tmp_path: Path, peer: Peer
-) -> None:
-    with running(tmp_path, peer) as bus, bus.follow("state") as states, bus.commanding(0.5):
-        until(lambda: peer.lines[-1].line.startswith(b"ap10.00"), 5.0, "steady driving")
-        silent, stale, _ = _fall_silent(peer, states)
-        print(f"peer falls silent -> stale in state: {stale.at - silent:.3f} s")
-        assert stale.at - silent < 0.1 + 0.5 + lost(silent, stale.at)
-        assert stale.value["code"] == "link_silent"
-        pose = bus.state()["x"]
-        zeros = peer.await_lines(2)
-        assert {entry.line for entry in zeros} == {ZERO_LINE}
-        assert bus.state()["x"] == pose
-        # After a silence under a second the commander is still armed, and the ramp starts from
-        # zero.
-        peer.reply = plain_reply
-        again = until(lambda: _moving_since(peer, zeros[-1].at), 5.0, "driving again")
-        assert wheels(again)[0] <= 20 * 0.05 + 0.01
-
-
-def _fall_silent(peer: Peer, states: Following) -> tuple[float, ReceivedMessage, float]:
-    """Mute the board and wait until the daemon sends zeros.
-
-    Returns the time of the muting, the state that reports the stale link, and the time of the last
-    line that was not zero.
-    """
-    peer.reply = silence
-    muted = time.monotonic()
-    stale = states.find(lambda state: state["link"] == "stale", 5.0, "stale", after=muted)
-    until(lambda: peer.lines[-1].line == ZERO_LINE, 2.0, "zeros")
-    last = max(entry.at for entry in peer.lines if entry.line != ZERO_LINE)
-    return muted, stale, last
-
-
-def _moving_since(peer: Peer, after: float) -> bytes | None:
-    """Return the first line after this time that is not zero."""
-    moving = (entry.line for entry in peer.lines if entry.at > after and entry.line != ZERO_LINE)
-    return next(moving, None)
-
-
-@pytest.mark.slow
-def test_noise_between_good_replies_costs_only_itself(tmp_path: Path, peer: Peer) -> None:
-    noise = itertools.cycle([b"\x00\xff\xfe\r\n", b"ap10.0\n", b"", b"\r\n\r\n"])
-    peer.reply = lambda speeds: next(noise) + plain_reply(speeds)
-    with running(tmp_path, peer) as bus, bus.commanding(0.5):
-        until(lambda: bus.state()["x"] > 0.3, 5.0, "it drives")
-        state = bus.comes_to("driving")
-    assert state["counters"]["line_malformed"] > 10

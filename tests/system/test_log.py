@@ -18,7 +18,6 @@ from acsard.bus import robot_discovery
 from acsard.bus.address import Address
 from acsard.client import connect
 from acsard.client.connection import open_connection
-from acsard.core.messages.signature import public_name
 from acsard.host.own_identity import own_name
 from acsard.host.version import version
 from tests.system.harness import Bus, Daemon, Peer, acsard, running, until
@@ -44,21 +43,6 @@ def test_the_log_names_the_client_of_each_call_by_its_own_name(shared: Daemon, b
     assert re.fullmatch(r"patrol \?\?2J\?native\?/[0-9a-f]{16} \(native\)", stop)
     assert re.search(rf"{me} acsard call/[0-9a-f]{{16}} \(native\)$", clear)
     assert by(shared, "deactivate") == ["unnamed (native)"]
-
-
-@pytest.mark.parametrize("named", [True, False])
-def test_a_put_on_stop_is_reported_with_its_sender_id_or_the_session_that_stamped_it(
-    named: bool, shared: Daemon, bus: Bus
-) -> None:
-    stops = len(shared.events("stop"))
-    with open_connection(Address(shared.endpoint, "acsar", "")) as robot:
-        key, stamp = robot.key("stop"), robot.session.new_timestamp()
-        attachment = b'{"sender": "ann/s3cret"}' if named else b""
-        robot.session.put(key, b"", timestamp=stamp, attachment=attachment)
-        (line,) = until(lambda: shared.events("stop")[stops:], 5.0, "the stop is in the log")
-    session = public_name(str(stamp.get_id()))
-    unnamed = f"unnamed (native, session {session})"
-    assert line["by"] == (f"{public_name('ann/s3cret')} (native)" if named else unnamed)
 
 
 def test_one_program_that_puts_on_stop_and_calls_it_has_one_name(shared: Daemon, bus: Bus) -> None:

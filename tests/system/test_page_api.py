@@ -14,19 +14,12 @@ import select
 import signal
 import socket
 import sys
-import termios
-import time
-import urllib.error
-import urllib.request
-from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 import aiohttp
 import pytest
 
-from acsard.core.values import NS_PER_S
-from acsard.host.child import SILENCE_TIMEOUT_NS
 from acsard.recording.file import MAGIC
 from acsard.web.openapi import KEYS
 from tests.system.browser import Page, answer, hands, text
@@ -257,43 +250,6 @@ def test_a_daemon_in_a_terminal_serves_its_page_at_a_free_port_and_restarts_it(
             (third,) = daemon.page()
             daemon.signal(signal.SIGKILL)
             until(lambda: not Path(f"/proc/{third}").exists(), START_S, "the page ends too")
-
-
-@pytest.mark.slow
-@pytest.mark.nightly
-def test_the_page_starts_answers_and_stays_alive_while_nobody_reads_the_terminal(
-    tmp_path: Path,
-) -> None:
-    """A person has pressed Ctrl-S, or the program that shows the terminal is stopped."""
-    port = int(free_endpoint().rpartition(":")[2])
-    url = f"http://127.0.0.1:{port}"
-    config = write_config(tmp_path / "a.toml", {"web": {"address": [url]}})
-
-    def role() -> str:
-        with suppress(OSError):
-            return str(json.load(urllib.request.urlopen(f"{url}/api/whoami", timeout=2.0))["role"])
-        return ""
-
-    with Terminal(tmp_path, "--config", str(config)) as daemon:
-        daemon.shows(rf"page ready +{url}/")
-        (first,) = daemon.page()
-        termios.tcflow(daemon.slave, termios.TCOOFF)
-        try:
-            os.kill(first, signal.SIGKILL)
-            until(lambda: daemon.page() not in ([], [first]), START_S, "another page")
-            until(role, START_S, "the page answers")
-            (second,) = daemon.page()
-            # The page logs these refusals.
-            for _ in range(3):
-                with pytest.raises(urllib.error.HTTPError):
-                    urllib.request.urlopen(f"{url}/nothing", timeout=2.0)
-                time.sleep(SILENCE_TIMEOUT_NS / NS_PER_S / 2)
-            assert role() == "maintainer"
-            assert daemon.page() == [second]
-        finally:
-            termios.tcflow(daemon.slave, termios.TCOON)
-        daemon.seen = ""
-        daemon.shows(rf"page ready +{url}/")
 
 
 @pytest.mark.slow

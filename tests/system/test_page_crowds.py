@@ -7,7 +7,6 @@ With `-s` pytest prints the figures of each crowd.
 
 from __future__ import annotations
 
-import asyncio
 import http.client
 import json
 import math
@@ -22,7 +21,7 @@ import pytest
 
 from acsard.machine.authority import Authority
 from acsard.web.connections import MAX_CONNECTIONS
-from tests.system.browser import Hands, Page
+from tests.system.browser import Page
 from tests.system.bystander import lost
 from tests.system.harness import (
     PATIENCE_S,
@@ -217,32 +216,3 @@ def _timed(call: Callable[[], object]) -> float:
     call()
     took = time.monotonic() - begun
     return max(0.0, took - 4 * lost(begun, begun + took))
-
-
-async def test_a_phone_that_has_opened_the_page_drives_on_through_a_crowd(
-    hosts: Hosts, robot: Daemon, where: Path
-) -> None:
-    with Scene(hosts, robot, where, "2500 silent") as scene:
-        with inside(hosts.stranger):
-            session = scene.page.client(scene.token)
-            opened = await session.ws_connect(f"{scene.page.away}/ws", heartbeat=None)
-        async with session, opened, asyncio.timeout(4 * PATIENCE_S):
-            ours = Hands(opened)
-            await ours.say(subscribe="state", rate=50)
-            await ours.state(lambda state: state["link"] == "up")
-            await ours.until_driving(0.3)
-            holding = asyncio.create_task(ours.hold(0.3, 3 * PATIENCE_S))
-            # A state that was sent before the hold began does not count.
-            await ours.state(lambda state: state["mode"] == "driving")
-            coming = asyncio.create_task(asyncio.to_thread(scene.comes))
-            modes, end = list[str](), 0.0
-            while not end or time.monotonic() < end:
-                modes.append((await ours.state(lambda state: state["mode"]))["mode"])
-                if coming.done() and not end:
-                    coming.result()
-                    end = time.monotonic() + 1.0
-            holding.cancel()
-            await ours.drive(0.0)
-    # On a busy machine the simulated board may be late, which "waiting" says.
-    assert modes.count("driving") + modes.count("waiting") == len(modes)
-    assert modes.count("driving") > 0.9 * len(modes)

@@ -51,9 +51,6 @@ def test_a_twist_has_52_bytes_and_a_stamped_twist_76(bus: Bus, ros: BridgeHalf) 
     assert changes(before, bus.state()).keys() <= {"commands", "commands_of_new_senders"}
 
 
-# bad messages
-
-
 # announcements
 
 

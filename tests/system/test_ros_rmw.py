@@ -92,16 +92,6 @@ def unharmed_after(shared: Daemon) -> Iterator[None]:
 # an independent implementation
 
 
-def test_an_independent_client_decodes_the_odometry(fleet: Fleet) -> None:
-    fleet.sdk.do("follow", "/one/odom", ODOMETRY)
-    odometry = fleet.sdk.do("newest", "/one/odom")
-    assert (odometry["header"]["frame_id"], odometry["child_frame_id"]) == ("odom", "base_link")
-    assert odometry["pose"]["pose"]["orientation"]["w"] == pytest.approx(1.0, abs=1e-3)
-    assert len(odometry["pose"]["covariance"]) == 36
-    stamp = odometry["header"]["stamp"]
-    assert stamp["sec"] + stamp["nanosec"] / 1e9 == pytest.approx(time.time(), abs=5.0)
-
-
 @pytest.mark.parametrize(("robot", "commands"), [("one", COMMANDS), ("two", COMMANDS[:1])])
 def test_an_independent_client_drives_the_robot_behind_a_router_as_a_peer_or_a_client(
     fleet: Fleet, robot: str, commands: tuple[tuple[str, str, float], ...]
