@@ -32,7 +32,7 @@ VERBS = {
     "sim": "simulate a microcontroller on a pty, for a separate `acsard run --port …`",
     "check": "check the configuration and print it with all defaults",
     "topics": "list the robot's Zenoh keys: direction, type, rate, meaning",
-    "echo": "print the messages on a Zenoh key as JSON lines, or their rate",
+    "echo": "print the messages on a Zenoh key as JSON lines",
     "get": "query a Zenoh key once and print the answer as JSON",
     "top": "show the robot's status on one screen, live",
     "fleet": "show one line per robot, live",

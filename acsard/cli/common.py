@@ -111,7 +111,6 @@ def overrides(options: Mapping[str, object]) -> dict[str, dict[str, object]]:
 # Options by dotted key.
 OPTIONS = {
     "mcu.port": "--port",
-    "mcu.baud_rate": "--baud-rate",
     "robot.id": "--id",
     "ros.namespace": "--namespace",
     "record.directory": "--record",

@@ -22,11 +22,6 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.epilog = "\n".join(HELP)
     parser.formatter_class = argparse.RawDescriptionHelpFormatter
     add_speeds(parser, 0.5, 1.0, 0.0, "speed at the start, which keys change during the drive")
-    parser.add_argument(
-        "--source",
-        default="teleop",
-        help="send the commands as this command source (default: teleop)",
-    )
     add_bus(parser)
 
 
@@ -37,7 +32,7 @@ def main(args: argparse.Namespace) -> int:
             "acsard drive reads single key presses and uses the full screen, so run it in a "
             "terminal (with another TERM than dumb); a program must use acsard.client instead"
         )
-    with output_in_threads(MAX_LAST_OUTPUT_S), connected(args, args.source) as robot:
+    with output_in_threads(MAX_LAST_OUTPUT_S), connected(args, "teleop") as robot:
         if robot.where.tls and not has((us := robot.whoami()).role, COMMAND_ROLE):
             raise (NotPermittedError if us.role else NoAnswerError)(us.describe())
         ride = KeyboardDrive(robot, Keyboard(args.linear, args.angular), _limits(robot))

@@ -56,9 +56,6 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     add_config(check)
     add_port(check)
     check.add_argument(
-        "--baud-rate", type=int, metavar="N", help="baud rate to try first, from 9600 to 500000"
-    )
-    check.add_argument(
         "--yes",
         action="store_true",
         help="ask no questions. With the simulator, this option is enough; with a robot, "
@@ -73,8 +70,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def main(args: argparse.Namespace) -> int:
-    overrides = {"mcu.port": args.port, "mcu.baud_rate": args.baud_rate}
-    where, config = load(args.config, overrides)
+    where, config = load(args.config, {"mcu.port": args.port})
     _, configured = load(args.config)
     if args.write:
         writable(args.config)

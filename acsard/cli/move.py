@@ -28,15 +28,12 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         "after the other",
     )
     add_speeds(parser, 0.3, 0.8, 0.02, "highest speed")
-    parser.add_argument(
-        "--source", default="app", help="send the commands as this command source (default: app)"
-    )
     add_bus(parser)
 
 
 def main(args: argparse.Namespace) -> int:
     ways = _parsed(args.way)
-    with connected(args, args.source) as connection:
+    with connected(args) as connection:
         robot = Client(connection)
         try:
             for is_turn, amount in ways:

@@ -45,7 +45,6 @@ _PAGE = '  page    {where}, for a browser, when "page ready" stands below\n'
 def add_options(parser: argparse.ArgumentParser) -> None:
     add_config(parser)
     add_port(parser)
-    parser.add_argument("--baud-rate", type=int, metavar="N", help="from 9600 to 500000")
     parser.add_argument("--id", metavar="ID", help="the robot's id on the bus")
     parser.add_argument(
         "--namespace", metavar="NAME", help="prefix of the robot's ROS topics (ros.namespace)"
@@ -79,7 +78,6 @@ def options(args: argparse.Namespace) -> dict[str, object]:
     """Return the options by dotted key; None if they were not typed."""
     return {
         "mcu.port": args.port,
-        "mcu.baud_rate": args.baud_rate,
         "robot.id": args.id,
         "ros.namespace": args.namespace,
         "record.directory": args.record,

@@ -358,14 +358,9 @@ class Connection(Reads):
         state = self.get("state")
         return Pose(state.x, state.y, state.yaw)
 
-    def samples(
-        self,
-        name: str,
-        timeout: float | None = None,
-        look: Callable[[float], None] | None = None,
-    ) -> Iterator[zenoh.Sample]:
+    def samples(self, name: str, look: Callable[[float], None]) -> Iterator[zenoh.Sample]:
         """Yield samples of a key or wildcard, as `Subscription.until_silence` does."""
-        yield from self._subscription(name, exact=False).until_silence(timeout, look)
+        yield from self._subscription(name, exact=False).until_silence(None, look)
 
     def listen(self, name: str, callback: Callable[[zenoh.Sample], None]) -> Any:
         """Subscribe to a key. A thread of Zenoh calls `callback` with each sample.

@@ -38,7 +38,7 @@ MAX_KEYS = 6  # in one finding of `compared`
 
 # Set by options of `acsard run`, so a difference to the file is probably intended.
 OPTION_KEYS = (
-    "mcu.port", "mcu.baud_rate", "robot.id", "bus.listen", "bus.connect", "record.directory",
+    "mcu.port", "robot.id", "bus.listen", "bus.connect", "record.directory",
     "ros.namespace",
 )  # fmt: skip
 

@@ -82,19 +82,6 @@ def test_a_signal_ends_echo_within_2_s(shared: Daemon, bus: Bus, number: signal.
 
 
 @pytest.mark.slow
-def test_echo_measures_a_hundred_messages_per_second(shared: Daemon, bus: Bus) -> None:
-    begun = time.monotonic()
-    ended = tool(shared, "echo", "odom", "--rate", "-n", "2")
-    late = lost(begun)
-    assert ended.code == 0
-    first, second = (line.split() for line in ended.out.splitlines())
-    assert int(second[-1]) > int(first[-1])
-    # Measured over a second. A message that comes late at one end may also have come late at the
-    # other.
-    assert float(second[0]) == pytest.approx(100.0, abs=3.0 + 100.0 * late)
-
-
-@pytest.mark.slow
 def test_a_kept_setting_survives_a_restart_and_its_comments_stay(tmp_path: Path) -> None:
     endpoint, key = free_endpoint(), "limits.linear_speed"
     with Daemon(tmp_path, config={"limits": {"linear_speed": 0.5}}, endpoint=endpoint) as daemon:

@@ -196,7 +196,6 @@ def given_by(words: Iterable[str]) -> dict[str, object]:
 def test_each_option_sets_its_key_and_no_other_and_the_doctor_knows_them() -> None:
     words = {
         ("--port", "/dev/x"): ("mcu.port", "/dev/x"),
-        ("--baud-rate", "57600"): ("mcu.baud_rate", 57600),
         ("--id", "r7"): ("robot.id", "r7"),
         ("--namespace", "a/b"): ("ros.namespace", "a/b"),
         ("--record", "d"): ("record.directory", "d"),

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from types import SimpleNamespace
 from typing import Any
 
 import msgspec
 import pytest
 
-from acsard.cli import echo, main
-from acsard.cli.echo import _message_text, _print, rate_text
+from acsard.cli import main
+from acsard.cli.echo import _message_text, _print
 from acsard.cli.replies import json_line
 from acsard.core.messages.encodings import Decoder, Format, encode, encoding_name
 from acsard.core.messages.schema import (
@@ -61,7 +60,7 @@ def test_echo_survives_any_payload(payload: bytes) -> None:
     assert json_line("", payload).isprintable()
 
 
-def printed(robots: str, senders: str, most: int | None, timeout: float | None = None) -> int:
+def printed(robots: str, senders: str, most: int | None) -> int:
     """Print the messages of these senders in order, and return the exit code."""
     samples: Any = [
         SimpleNamespace(
@@ -72,7 +71,7 @@ def printed(robots: str, senders: str, most: int | None, timeout: float | None =
         for sender in senders
     ]
     silence: Any = SimpleNamespace(heard=lambda: None, explain=lambda: None)
-    return _print(iter(samples), None, most, robots, timeout, silence)
+    return _print(iter(samples), None, most, robots, silence)
 
 
 @pytest.mark.parametrize(
@@ -95,13 +94,6 @@ def test_a_number_of_messages_counts_for_each_robot(
     assert printed(robots, senders, most) == code
     lines = capsys.readouterr().out.splitlines()
     assert "".join(msgspec.json.decode(line)["robot"] for line in lines) == ids
-
-
-def test_one_robot_does_not_hide_the_silence_of_another(
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    assert printed("ab", "aaab", 1, timeout=-1.0) == 1
-    assert len(capsys.readouterr().out.splitlines()) == 1
 
 
 def test_a_key_without_a_short_form_is_refused_with_those_that_have_one(
@@ -128,39 +120,3 @@ def test_a_message_without_a_short_form_is_shown_as_its_json() -> None:
     assert msgspec.json.decode(_message_text(decoder, "", b"\xff", "")) == {
         "undecodable": repr(b"\xff")
     }
-
-
-@each("times", [[], [3.0], [1.0, 1.0]])
-def test_messages_without_a_time_between_them_have_no_rate(times: list[float]) -> None:
-    assert "Hz" not in rate_text(times)
-
-
-def test_the_rate_of_three_messages_equals_the_one_computed_by_hand() -> None:
-    # The gaps are 10 and 20 ms: mean 15, deviation 5, and the 99th percentile lies 99 % of the way
-    # up.
-    assert " ".join(rate_text([1.0, 1.01, 1.03]).split()) == (
-        "66.67 Hz gaps ms: min 10.00 p50 15.00 p99 19.90 max 20.00 std 5.00 n 3"
-    )
-
-
-def test_a_line_of_the_rate_covers_ten_seconds_of_a_fast_stream(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    """The clock is virtual, and 2000 messages arrive in each second."""
-    now, takes = [0.0], list[Callable[[Any], None]]()
-
-    def sleep(seconds: float) -> None:
-        for _ in range(round(2000 * seconds)):
-            now[0] += 1 / 2000
-            takes[0](None)
-
-    def listen(_: str, take: Callable[[Any], None]) -> SimpleNamespace:
-        takes.append(take)
-        return SimpleNamespace(undeclare=lambda: None)
-
-    robot: Any = SimpleNamespace(listen=listen)
-    monkeypatch.setattr(echo, "time", SimpleNamespace(monotonic=lambda: now[0], sleep=sleep))
-    assert echo._print_rates(robot, "odom", 12) == 0
-    last = capsys.readouterr().out.splitlines()[-1]
-    assert last.startswith(" 2000.00 Hz")
-    assert int(last.split()[-1]) == pytest.approx(20_000, abs=1)
