@@ -23,11 +23,7 @@ get inof
 get nonsense
 get srv/stop
 get info --id acsar,other
-echo oddom --timeout 0.01
-echo cmd/nobody --timeout 0.1
-echo battery --timeout 0.1
-echo imu --timeout 0.1
-echo state -n 1 --timeout 0.5 --short --id acsar,other
+echo oddom
 call stpo
 call set_pose
 call set_pose 1 2
