@@ -453,7 +453,6 @@ class Run:
                 fault = (name, tuple(values))
                 self.active.append(fault)
                 self._troubled(name)
-                self.witness.lying_ns = self.true_ns
                 self._board()
                 if name == "echo":
                     self.echo.begin()

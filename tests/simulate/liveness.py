@@ -177,7 +177,7 @@ class Liveness:
         zero_ns, (begun_ns, ended_ns) = wish.armed_ns, self._stall
         if self._is_armed(name) or zero_ns <= self._silent_ns.get(name, -1):
             return
-        settled_ns = zero_ns + (self.run.witness.pause_ns if wish.shared else 0)
+        settled_ns = zero_ns + (NS if wish.shared else 0)
         if zero_ns <= ended_ns and settled_ns >= begun_ns - self._tick_ns:
             self._interrupted[name] = zero_ns
         elif self._interrupted.get(name) != zero_ns:
@@ -334,7 +334,7 @@ class Liveness:
         number = 10**6
         if plan["lawful"] != "a new client" and own:
             sender = own[0]
-        zeros_s = run.witness.pause_ns / NS + 1.0
+        zeros_s = 2.0
         step_ns = min(50_000_000, run.witness.timeout[sender["source"]] // 4)
         # A share above 1 shows whether the limits of before a restart are still in force.
         share = plan.get("share", 0.5)

@@ -12,7 +12,6 @@ plays only the recorded seed of each row, which takes seconds, and changes no fi
 from __future__ import annotations
 
 import argparse
-import hashlib
 import json
 import os
 import re
@@ -38,14 +37,6 @@ TABLE = Path(__file__).with_name("PLANTED.md")
 
 FAULT_MINUTES, CASE_MINUTES = 10.0, 30.0
 """Core-minutes within which a fault and a case must be found."""
-
-MEASURED_WITH = (
-    "plan", "roads", "actors", "ages", "bad_moments", "beats", "board_inputs", "causes", "course",
-    "damage", "followed", "gyro_faults", "jerk", "liveness", "log_lines", "moments_of_age",
-    "moments_of_wheels", "plugging", "pose", "product", "promises", "reasons", "reports", "spread",
-    "wheels",
-)  # fmt: skip
-"""Modules of the simulator that make the plans, play them and judge them."""
 
 CHILD = """
 import json, sys
@@ -79,18 +70,6 @@ class Row(NamedTuple):
     """Processor time until then, core-minutes."""
     simulated: str
     """Simulated time until then, minutes."""
-    simulator: str
-    """The version of the simulator that measured the row."""
-
-
-def version() -> str:
-    """Return a digest of the modules that create, play and judge plans.
-
-    With another version a seed may have another plan or another finding.
-    """
-    here = Path(__file__).parent
-    code = b"".join((here / f"{name}.py").read_bytes() for name in MEASURED_WITH)
-    return hashlib.sha256(code).hexdigest()[:6]
 
 
 def plant(fault: Fault, tree: Path) -> None:
@@ -139,7 +118,7 @@ def hunt(fault: Fault, minutes: float) -> Row:
 
 def _row(fault: Fault, promise: str, seed: str, cpu_s: float, simulated_s: float) -> Row:
     core, simulated = f"{cpu_s / 60:.2f}", f"{simulated_s / 60:.1f}"
-    return Row(fault.name, fault.breaks, promise, seed, core, simulated, version())
+    return Row(fault.name, fault.breaks, promise, seed, core, simulated)
 
 
 def broken_again(fault: Fault, row: Row) -> str:
@@ -211,17 +190,15 @@ processor time of the process that plays, on a machine that other work kept busy
 
 For some faults only plans of one kind are played, for example with an emergency stop
 (`PLANS_OF_FAULT` in `planted_faults.py`). A fault must be found within
-{fault:g} core-minutes, a case within {case:g}. A row keeps its last measurement. Its last column is
-the version of the simulator that measured it: a digest of the modules that make, play and judge
-plans. With the present plans, another seed may find an older row's fault. `--again` prints the
-present version, plays the seed of each row again, and lists the rows that no longer hold. "not
-found" says that no seed found the fault in the core-minutes of that row. `--missing` measures those
-faults again, and all without a row.
+{fault:g} core-minutes, a case within {case:g}. A row keeps its last measurement; with the present
+plans and judges, another seed may find its fault. `--again` plays the seed of each row again, and
+lists the rows that no longer hold. "not found" says that no seed found the fault in the minutes
+of that row. `--missing` measures those faults again, and all without a row.
 """
 
 COLUMNS = """
-| name | what it breaks | the promise that found it | seed | core-min | simulated min | simulator |
-|---|---|---|---|---|---|---|
+| name | what it breaks | the promise that found it | seed | core-min | simulated min |
+|---|---|---|---|---|---|
 """
 
 
@@ -259,7 +236,6 @@ def again(faults: list[Fault], jobs: int) -> int:
     Faults without a recorded seed are left out.
     """
     rows = read()
-    present = version()
     recorded = [(fault, rows[fault.name]) for fault in faults if rows.get(fault.name)]
     recorded = [(fault, row) for fault, row in recorded if row.seed]
     with ThreadPoolExecutor(jobs) as pool:
@@ -268,8 +244,8 @@ def again(faults: list[Fault], jobs: int) -> int:
     for (fault, row), reason in zip(recorded, reasons, strict=True):
         if reason:
             lost += 1
-            print(f"{fault.name}: seed {row.seed} of version {row.simulator} {reason}")
-    print(f"{len(recorded) - lost} of {len(recorded)} rows hold; the simulator is {present}")
+            print(f"{fault.name}: seed {row.seed} {reason}")
+    print(f"{len(recorded) - lost} of {len(recorded)} rows hold")
     return lost
 
 

@@ -75,13 +75,6 @@ HARMLESS = {
 }  # fmt: skip
 """Troubles of the board for which the robot may not latch a fault."""
 
-DISOBEYS_NS = NS
-"""Within this time, three response times and three time constants of a motor, a wheel that does
-not obey is a fault."""
-
-CLEARLY = 4.0
-"""rad/s. From this speed on, a wheel that does not obey cannot be taken for one that does."""
-
 DIALECTS = {
     "unpadded", "spaces", "trailing_comma", "no_sample", "no_check", "constant_answers",
 }  # fmt: skip
@@ -138,7 +131,6 @@ class Witness:
         """Sources whose senders a silence of one second arms."""
         self.priority = {s["name"]: s["priority"] for s in commands["sources"]}
         self.file_timeout = {s["name"]: int(s["timeout"] * NS) for s in commands["sources"]}
-        self.file_pause_ns = NS
         rate = config["control"].get("rate", 100.0)
         if rate == "auto":
             rate = 100.0  # at 115200 baud the longest line allows more
@@ -159,7 +151,6 @@ class Witness:
         """Calls that may have to release a latch, which is not certain since the daemon ended."""
         self.offs: list[int] = []
         """Arrivals of each `deactivate` that no `activate` has released."""
-        """Start of a daemon that waits for its first `activate`."""
         self.ending_ns: int | None = None
         """When the daemon got SIGTERM."""
         self.fault_ns: int | None = None
@@ -175,19 +166,6 @@ class Witness:
         """Board faults and when each was last active."""
         self.lies: list[tuple[str, tuple[Any, ...]]] = []
         """The present faults of the board, without its lasting properties."""
-        self.lying_ns = 0
-        """When the last fault of the board began."""
-        response_time = config.get("feedback", {}).get("response_time", 0.2)
-        coarse = config.get("sim", {}).get("encoder_counts", 3200) < 400
-        lag = config.get("sim", {}).get("motor_time_constant", 0.1)
-        self._slows_ns = int(3 * lag * NS)
-        """Time in which a wheel follows the largest part of a change of its command."""
-        seen_ns = DISOBEYS_NS + int(3 * response_time * NS)
-        self._disobeys_ns = 0 if coarse else seen_ns
-        """Within this time and `_slows_ns`, a wheel that does not obey is a fault; 0 if the robot
-        cannot see it."""
-        self._driven: list[tuple[int, float]] = [(0, 0.0)] * 4
-        """Since when each wheel has been commanded to turn clearly and in one direction."""
         self.rested = True
         """Whether the robot has stood for a second since the last line that was no zero."""
         self._turns_ns = 0
@@ -223,7 +201,6 @@ class Witness:
         if self.blocked_ns is not None:
             self.blocked_ns = at_ns  # this daemon has not yet had the time to find that out
         self.timeout = dict(self.file_timeout)
-        self.pause_ns = self.file_pause_ns
         self.limits = dict(self.file)
         self.before = dict(self.limits)
         self.changed_ns = at_ns
@@ -361,7 +338,7 @@ class Witness:
 
     def _arm(self, known: Sender, now_ns: int) -> None:
         """Arm a shared identity by its latest zero after which the neutral pause is over."""
-        place = bisect_right(known.zeros, (now_ns - self.pause_ns, now_ns))
+        place = bisect_right(known.zeros, (now_ns - NS, now_ns))
         if place:
             known.armed_ns = max(known.armed_ns, known.zeros[place - 1][1])
 
@@ -437,9 +414,9 @@ class Witness:
                     min(low, value) if "deceleration" in key else max(low, value)
                 )
                 continue
-            before_ns = self.pause_ns, dict(self.timeout)
+            before_ns = self.timeout[parts[2]]
             self.timeout[parts[2]] = int(value * NS)
-            if before_ns != (self.pause_ns, self.timeout):
+            if before_ns != self.timeout[parts[2]]:
                 self.arming(asked_ns)
 
     def unanswered(self, verb: str, arrived_ns: int) -> None:
@@ -583,7 +560,6 @@ class Witness:
                 # This stop has taken the place of a line, whose speed may have grown for longer.
                 made_ns = self.last_ns
             self.last, self.last_ns, self.coasting, self.braking = ZERO, made_ns, None, None
-            self._driven = [(at_ns, 0.0)] * 4
             self.softest = dict(self.limits)
             return
         self.counts["moving lines"] += 1
@@ -610,27 +586,7 @@ class Witness:
         else:
             self._check_rest(at_ns, hold, grows, line, wheels)
         self._wished(at_ns, wheels, before, grows, line)
-        self.obeyed(at_ns, wheels)
         self.last, self.last_ns, self.cut, self.rested = wheels, made_ns, False, False
-
-    def obeyed(self, at_ns: int, wheels: tuple[float, ...]) -> None:
-        """Check that the robot reports a fault if a wheel clearly does not obey."""
-        clear = self.mode == "driving" and self.linked
-        for place, speed in enumerate(wheels):
-            since_ns, before = self._driven[place]
-            if not clear or abs(speed) < CLEARLY or speed * before <= 0.0:
-                since_ns = at_ns
-            self._driven[place] = since_ns, speed
-        if len(self.lies) != 1 or not disobeys(*self.lies[0]) or not self._disobeys_ns:
-            return
-        name, values = self.lies[0]
-        others = (last_ns for kind, last_ns in self.troubles.items() if kind != name)
-        since_ns = max(self.lying_ns, self._stalled[1], *others, 0)
-        wheel = next(w for w, (place, _) in enumerate(self.motors) if place == values[0])
-        begun_ns = max(since_ns, self._driven[wheel][0]) + self._slows_ns
-        if at_ns - begun_ns > self._disobeys_ns:
-            text = f"wheel {wheel} with {name}{values} is commanded {wheels[wheel]:.2f} rad/s"
-            raise BrokenError("a wheel that does not obey is a fault", at_ns, text)
 
     def stalls(self, begun_ns: int, ended_ns: int) -> None:
         """Note a stall of the host. The steps after it read the bytes that arrived during it.
@@ -907,13 +863,6 @@ class Witness:
         if wheel:
             scale = min(scale, limits["wheel_speed"] / wheel)
         return v * scale, w * scale
-
-
-def disobeys(name: str, values: tuple[Any, ...]) -> bool:
-    """Return whether a wheel with this fault of the board clearly does not obey its command."""
-    if name == "bias":
-        return values[1] in (-1.0, 9.0)
-    return name in ("reversed_motor", "reversed_encoder")
 
 
 def _fastest(wheels: tuple[float, ...]) -> float:

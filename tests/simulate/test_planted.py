@@ -8,9 +8,8 @@ import re
 import pytest
 
 from tests.each import each
-from tests.simulate import planted
 from tests.simulate.planted import CASE_MINUTES, FAULT_MINUTES, TABLE, edited, read, text_of
-from tests.simulate.planted_faults import CASES, FAULTS, PLANS_OF_FAULT, Fault
+from tests.simulate.planted_faults import CASES, FAULTS, Fault
 
 ALL = (*FAULTS, *CASES)
 
@@ -22,12 +21,6 @@ RAISES = {"commands raise"}
 def test_a_fault_fits_the_product_and_is_still_a_program(fault: Fault) -> None:
     for text in edited(fault).values():
         ast.parse(text)
-
-
-def test_each_fault_has_a_name_of_its_own_and_plans_are_chosen_for_faults_that_exist() -> None:
-    names = {fault.name for fault in ALL}
-    assert len(names) == len(ALL)
-    assert names | {name.split()[0] for name in names} >= PLANS_OF_FAULT.keys()
 
 
 @pytest.mark.parametrize(("faults", "minutes"), [(FAULTS, FAULT_MINUTES), (CASES, CASE_MINUTES)])
@@ -49,25 +42,10 @@ def test_the_page_is_the_one_that_the_program_writes() -> None:
 
 def test_each_promise_is_broken_by_a_planted_fault() -> None:
     """Otherwise nobody knows whether its judge sees anything."""
-    judges = " ".join((TABLE.parent / f"{name}.py").read_text() for name in planted.MEASURED_WITH)
+    judges = " ".join(path.read_text() for path in TABLE.parent.glob("*.py"))
     promises = re.findall(r'BrokenError\(\s*f?"([^"]+)"', judges)
     found = [row.promise for row in read().values()]
     assert len(promises) > 60
     for promise in promises:
         pattern = re.sub(r"\{\w+\}", ".+", promise)
         assert any(re.fullmatch(pattern, name) for name in found), promise
-
-
-def test_a_change_of_a_judge_changes_the_version() -> None:
-    """Each module of the simulator is hashed, unless it cannot change the finding of a seed."""
-    beside = {"__init__", "__main__", "shrink"}
-    planting = {"planted", "planted_faults"}
-    modules = {path.stem for path in TABLE.parent.glob("*.py")}
-    tests = {name for name in modules if name.startswith("test_")}
-    assert modules - beside - planting - tests == set(planted.MEASURED_WITH)
-
-
-@pytest.mark.slow
-def test_a_fault_of_the_first_line_is_found_in_a_copy_of_the_product() -> None:
-    fault = next(fault for fault in FAULTS if fault.name == "codec zeros")
-    assert planted.hunt(fault, 0.1).promise == "every line is whole"
