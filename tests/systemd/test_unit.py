@@ -79,7 +79,7 @@ def check_clean_stop(container: Container) -> None:
     assert [container.show(name) for name in names] == ["success", "0", "inactive"]
 
 
-def test_the_unit_starts_reports_ready_publishes_and_drives(
+def test_the_unit_starts_reports_ready_drives_and_ramps_down_when_it_is_stopped(
     container: Container, board: Board, driver: Driver
 ) -> None:
     began = time.monotonic()
@@ -94,8 +94,12 @@ def test_the_unit_starts_reports_ready_publishes_and_drives(
     driver.drives(board)
     status = "driving at 0.5 m/s, commanded by app"
     until(lambda: container.show("StatusText") == status, 3.0, "its status says so")
-    driver.sends(0.0)
-    until(lambda: "0.0 m/s" in container.show("StatusText"), 3.0, "its status follows")
+    began = time.monotonic()
+    check_clean_stop(container)
+    ramp = [float(entry.line[2:7]) for entry in board.since(began) if entry.line != b"-"]
+    assert ramp == sorted(ramp, reverse=True), "a monotone fall"
+    assert len({speed for speed in ramp if 0 < speed < 10}) > 5, "a ramp, not a cut"
+    assert ramp[-1] == 0.0
 
 
 def test_the_daemon_has_a_dynamic_user_a_real_time_loop_and_no_capabilities(
@@ -132,22 +136,6 @@ def test_a_stall_is_ended_by_the_watchdog_with_stacks_and_followed_by_zeros(
     assert "Fatal Python error: Aborted" in text
     assert f'File "{HOME}/src/acsard/' in text, "where it hung"
     assert "Watchdog timeout" in container.messages()
-
-
-def test_stop_ramps_down_ends_with_stop_and_exits_0(
-    container: Container, board: Board, driver: Driver
-) -> None:
-    container.start()
-    driver.drives(board)
-    began, waited = time.monotonic(), container.waited()
-    check_clean_stop(container)
-    took = time.monotonic() - began - container.waited() + waited
-    lines = [entry for entry in board.since(began) if entry.line != b"-"]
-    ramp = [float(entry.line[2:7]) for entry in lines]
-    assert lines[-1].line == ZERO
-    assert ramp == sorted(ramp, reverse=True), "a monotone fall"
-    assert len({speed for speed in ramp if 0 < speed < 10}) > 5, "a ramp, not a cut"
-    assert took < 1.5
 
 
 _FILLER = """\
