@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from itertools import pairwise
 
 import msgspec
@@ -16,7 +15,6 @@ from acsard.core.config.settings import (
     WheelMap,
 )
 from acsard.core.messages.schema import Beat, JointState, TFMessage
-from acsard.daemon.pacing import MAX_IDLE_WAKES
 from tests.scenarios.world import World
 
 
@@ -167,30 +165,6 @@ def test_a_command_that_does_not_count_sends_no_early_line(world: World) -> None
         world.put("cmd/stranger", b"{}")
     world.run(0.0039)
     assert sent_after(world, at_ns) == []
-
-
-def unplug(world: World) -> None:
-    world.port.unplug()
-
-
-def silence(world: World) -> None:
-    world.mcu.muted = True
-
-
-def block(world: World) -> None:
-    world.port.blocked = True
-
-
-@pytest.mark.parametrize("trouble", [unplug, silence, block])
-def test_a_flood_that_no_line_can_answer_makes_few_steps(
-    world: World, trouble: Callable[[World], None]
-) -> None:
-    world.hold(0.3, seconds=0.5, hz=1000.0)
-    trouble(world)
-    world.run(0.3)
-    steps = world.steps
-    world.hold(0.0, seconds=1.0, hz=1000.0)
-    assert world.steps - steps <= 100 * (3 + MAX_IDLE_WAKES)
 
 
 def test_the_reported_latencies_of_a_command_are_the_real_ones(world: World) -> None:

@@ -33,7 +33,7 @@ from acsard.core.ros.channels import BY_KEY, CHANNELS, CMD_VEL_IN, LOG_CHANNEL
 from acsard.core.ros.shapes import log, state
 from acsard.recording.export import export
 from acsard.recording.file import Recording
-from acsard.recording.published import MEASURED_ROWS, published
+from acsard.recording.published import MEASURED_ROWS
 from tests.scenarios.taped import (
     ADDED,
     Tape,
@@ -72,14 +72,6 @@ def driven(config: Config) -> tuple[World, Tape]:
     return world, tape
 
 
-def exported(recording: Recording) -> Said:
-    messages: Said = defaultdict(list)
-    for item in published(recording):
-        messages[item.channel.native.replace("<source>", item.source)].append(item.message)
-    assert recording.damage == []
-    return messages
-
-
 @pytest.fixture(
     scope="module",
     params=[
@@ -92,13 +84,6 @@ def recorded(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFa
     world, tape = driven(request.param)
     path = tmp_path_factory.mktemp("export") / "drive.rec.zst"
     return world, tape, Recording([tape.save(path, request.param)])
-
-
-@pytest.fixture(scope="module")
-def both(recorded: Any) -> Any:
-    """The world with the published messages, its recorder, and the exported messages."""
-    world, tape, recording = recorded
-    return world, tape, exported(recording)
 
 
 @pytest.fixture(scope="module")
@@ -125,20 +110,6 @@ def happened(world: World) -> list[Any]:
         assert isinstance(events, Events)
         log_events += events.events[len(events.events) - (events.total - len(log_events)) :]
     return log_events
-
-
-def test_every_line_reason_of_the_log_is_a_reason_that_the_state_has(both: Any) -> None:
-    _, tape, exports = both
-    lines = [line for line in exports[LOG_CHANNEL.native] if line.name == "reason"]
-    steps = {step.now.wall_ns: step.recorded.status for step in tape.steps()}
-    assert lines
-    for line in lines:
-        status = steps[line.stamp.to_ns()]
-        mode, reason = status.mode, status.reason
-        assert line.msg.partition(" (by ")[0] == f"{mode}: {reason}"
-
-
-# the file
 
 
 def commanded(source: str) -> str:

@@ -123,17 +123,3 @@ def test_a_gyro_that_dies_is_reported_and_the_wheels_go_on() -> None:
     made.hold(0.3, 0.5, 1.0)
     reports = [event.text.partition(":")[0] for event in made.events if event.name == "gyro"]
     assert reports == ["waiting for rest", "waiting for turn", "silent", "used"]
-
-
-@pytest.mark.slow
-def test_wheels_that_lose_their_grip_are_reported() -> None:
-    made = world()
-    wandering(made, 5, seconds=20.0)
-    made.drive(0.0, 1.0, 2.0)
-    assert made.state.gyro == "used"
-    made.mcu.vehicle.turn_slip = 0.9
-    made.hold(0.0, 1.0, 0.5)
-    assert made.state.gyro == "disagrees"
-    drive = Drive(made)
-    drive.hold(0.0, 1.0, 3.0)
-    assert drive.error < 0.02

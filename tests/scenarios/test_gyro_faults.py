@@ -1,4 +1,4 @@
-"""What a faulty gyro, a second gyro or a restless encoder may do to the heading.
+"""What a faulty gyro or a second gyro may do to the heading.
 
 The robot stands, turns to both sides, and drives round three corners. The wheels do not skid, so
 the heading must stay within three standard deviations, and the turn that the wheels must claim
@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import math
 import random
-import re
 from collections.abc import Callable
 
 import msgspec
@@ -18,7 +17,7 @@ import pytest
 from acsard.core.config.settings import Config, McuConfig, OdometryConfig, SimConfig
 from acsard.core.incoming.commands import Arrival
 from acsard.core.simulator.simulated_robot import Observation
-from acsard.core.values import NS_PER_S, Received
+from acsard.core.values import NS_PER_S
 from tests.scenarios.imperfect_gyro import ImperfectGyro
 from tests.scenarios.world import World
 
@@ -33,17 +32,17 @@ Rate = Callable[[float, float], float]
 class Bench(World):
     """A robot on a serial port, with another program's gyro: `rate(seconds, true)` in rad/s."""
 
-    def __init__(self, rate: Rate | None = None, period: int = 1, counts: int = 1440) -> None:
+    def __init__(self, period: int = 1) -> None:
         super().__init__(
             Config(
                 mcu=McuConfig(port="/dev/ttyUSB0"),
                 odometry=OdometryConfig(gyro=True),
-                sim=SimConfig(encoder_counts=counts),
+                sim=SimConfig(encoder_counts=1440),
             ),
             gyro=ImperfectGyro(),
         )
         self.dice = random.Random(1)
-        self.rate: Rate = rate or (lambda t, true: true + self.noise())
+        self.rate: Rate = lambda t, true: true + self.noise()
         self.others: list[tuple[str, Rate]] = []
         """Further programs that publish `imu`, each with its frame."""
         self.first: list[tuple[str, Rate]] = []
@@ -52,10 +51,6 @@ class Bench(World):
         self.does: set[str] = set()
         self._period, self._begun_ns, self._yaw, self._told = period, self.now_ns, 0.0, 0.0
         self._mean: list[float] = []
-        self.dither: Callable[[int], list[float]] | None = None
-        self._lines = 0
-        feed = self.port.feed
-        self.port.feed = lambda received: feed(self._dithered(received))  # type: ignore[method-assign]
 
     def noise(self) -> float:
         return 0.003 + self.dice.gauss(0.0, 0.004)
@@ -79,23 +74,6 @@ class Bench(World):
                 }
             )
             self.bus.arrivals.append(Arrival("imu", True, payload, "", sight.at_ns, None, ""))
-
-    def _dithered(self, received: Received) -> Received:
-        if self.dither is None or not received.data.startswith(b"ap00.0"):
-            return received
-        self._lines += 1
-        speeds = self.dither(self._lines)
-        words = (
-            f"{letter}{'n' if v < 0 else 'p'}{abs(v):05.2f}"
-            for letter, v in zip("abcd", speeds, strict=True)
-        )
-        text, count = re.subn(
-            rb"a[pn]00\.0\d,b[pn]00\.0\d,c[pn]00\.0\d,d[pn]00\.0\d",
-            ",".join(words).encode(),
-            received.data,
-        )
-        assert count <= 1
-        return Received(received.at, text)
 
     def leg(self, linear: float, angular: float, seconds: float) -> None:
         for _ in range(round(seconds * 20)):
@@ -252,33 +230,3 @@ def test_a_second_gyro_on_the_key_makes_no_wrong_and_certain_heading(who: str) -
     if who == "another frame":
         assert bench.heading < SMALL
         assert bench.state.counters["imu_second_sender"] > 0
-
-
-def one_count(n: int) -> list[float]:
-    return [0.0, 0.0, 0.0, (-1) ** n * 0.44]
-
-
-def both_of_a_side(n: int) -> list[float]:
-    return [0.0, (-1) ** n * 0.44, (-1) ** n * 0.44, 0.0]
-
-
-def one_of_three(n: int) -> list[float]:
-    return [0.0, 0.0, 0.0, 0.05 if n % 3 == 0 else 0.0]
-
-
-def ever(n: int) -> list[float]:
-    return [0.0, 0.02, 0.0, 0.0]
-
-
-@pytest.mark.slow
-@pytest.mark.variations(4)
-@pytest.mark.parametrize("dither", [one_count, both_of_a_side, one_of_three, ever])
-def test_a_robot_whose_encoder_dithers_at_rest_uses_its_gyro(
-    dither: Callable[[int], list[float]],
-) -> None:
-    bench = Bench()
-    bench.dither = dither
-    bench.course()
-    assert "used" in bench.does
-    assert bench.heading < SMALL
-    assert bench.worst < 0.01

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import random
-from contextlib import nullcontext
 
 import pytest
 
@@ -13,14 +12,11 @@ from acsard.core.config.settings import Config, ControlConfig, McuConfig, SimCon
 from tests.scenarios.world import World
 
 
-def driven(counts: int, reporting: bool) -> World:
-    """Return a robot that has driven at random for ten seconds and stopped.
-
-    `reporting` selects a free-running board instead of a prompted one.
-    """
-    mcu = McuConfig(reply_period=0.01 if reporting else 0.0)
+def driven(counts: int) -> World:
+    """Return a robot with a free-running board that has driven at random and stopped."""
+    mcu = McuConfig(reply_period=0.01)
     world, dice = World(Config(mcu=mcu, sim=SimConfig(encoder_counts=counts))), random.Random(4)
-    with world.mcu.free_running(0.01) if reporting else nullcontext():
+    with world.mcu.free_running(0.01):
         world.run(0.5)
         for _ in range(4):
             world.drive(dice.choice((-1, 1)) * dice.uniform(0.3, 0.9), dice.uniform(-1, 1), 2.5)
@@ -39,21 +35,13 @@ def off(world: World) -> float:
     "counts", [20, *(pytest.param(counts, marks=pytest.mark.slow) for counts in (16, 96, 400))]
 )
 def test_a_robot_that_reports_by_its_own_clock_is_where_its_lines_say(counts: int) -> None:
-    world = driven(counts, reporting=True)
+    world = driven(counts)
     assert world.state.encoder_counts == [0] * 4
     assert ("coarse_encoder_lines" in world.state.counters) is (counts < 400)
     assert "line_implausible" not in world.state.counters
     assert not [event for event in world.events if event.name in ("fault", "lines_implausible")]
     # a count of each wheel at either end, twice that through the heading, and the shape of the arcs
     assert off(world) < 0.005 + 3 * math.tau / counts * 0.05
-
-
-@pytest.mark.parametrize("counts", [20, pytest.param(40, marks=pytest.mark.slow)])
-def test_no_line_of_a_robot_that_answers_at_uneven_times_is_dropped(counts: int) -> None:
-    world = driven(counts, reporting=False)
-    assert "line_implausible" not in world.state.counters
-    assert not [event for event in world.events if event.name == "fault"]
-    assert world.state.encoder_counts == [0] * 4
 
 
 @pytest.mark.parametrize("configured", [True, False])

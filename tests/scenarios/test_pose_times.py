@@ -3,92 +3,21 @@
 from __future__ import annotations
 
 import math
-import random
-from contextlib import ExitStack, nullcontext
+from contextlib import ExitStack
 from typing import Literal
 
 import numpy as np
 import pytest
-from msgspec.structs import replace
 
 from acsard.core.config.settings import Config, McuConfig, SimConfig
-from acsard.core.messages.schema import JointState, RobotState
-from acsard.core.values import Estimate, Pose
+from acsard.core.values import Estimate
 from tests.scenarios.world import World
 from tests.stepped import Outputs
-from tests.unit.odometer import arc
 
 FINE = SimConfig(encoder_counts=20_000)
 """Fine encoders, so that the two decimals of a line limit its accuracy."""
 
 COUNTS = 3200
-
-
-class Drive:
-    """8 s of random driving in eight legs. In each leg the host stalls, or lines are lost."""
-
-    def __init__(self, config: Config, reports: bool, batched: bool = False) -> None:
-        period = 0.01 if reports else 0.0
-        made = World(replace(config, mcu=replace(config.mcu, reply_period=period)))
-        self.world, self.faults = made, ExitStack()
-        made.bus.wanted_keys.add("wheel_states")
-        if batched:
-            self.faults.enter_context(made.mcu.ftdi())
-        if reports:
-            self.faults.enter_context(made.mcu.free_running(0.01))
-        made.run(1.5)
-        made.drive(0.0, 0.0, 0.2)
-
-    def error(self, stall: float = 0.0, lost: float = 0.0) -> float:
-        """Drive, and return the final position error in m.
-
-        Args:
-            stall: Length of each stall of the host, s.
-            lost: Length of each burst of lost lines, s.
-        """
-        made, chance = self.world, random.Random(4)
-        with self.faults:
-            for _ in range(8):
-                linear, angular = chance.uniform(0.2, 0.8), chance.uniform(-1.5, 1.5)
-                made.hold(linear, angular, 0.5)
-                with made.mcu.lost_replies(1) if lost else nullcontext():
-                    made.run(lost)
-                made.stall(stall)
-                made.hold(linear, angular, 0.5)
-            made.hold(0.0, 0.0, 1.0)
-        assert made.loop.robot.travelled > 1.5
-        state = made.state
-        print(f"{1000 * self.off(state):.1f} mm off after {made.loop.robot.travelled:.1f} m")
-        return self.off(state)
-
-    @property
-    def floor(self) -> float:
-        """The position error in m that remains if the sample time of each line is known exactly.
-
-        It is valid for a board that reports every 10 ms.
-        """
-        pose = Pose()
-        for line in self.world.bus.published["wheel_states"]:
-            assert isinstance(line, JointState)
-            front_right, front_left, rear_left, rear_right = line.velocity
-            right, left = (front_right + rear_right) / 2 * 0.01, (front_left + rear_left) / 2 * 0.01
-            pose = arc(pose, (right + left) / 2 * 0.05, (right - left) * 0.05 / 0.30)
-        return self.off(pose)
-
-    def off(self, pose: RobotState | Pose) -> float:
-        """Return the distance of the pose from the robot's true place, m."""
-        true = self.world.mcu.vehicle.pose
-        return math.dist((pose.x, pose.y), (true.x, true.y))
-
-
-REPORTS = pytest.mark.parametrize("reports", [False, True], ids=["prompted", "reporting"])
-
-
-@pytest.mark.variations(4)
-@REPORTS
-@pytest.mark.parametrize("stall", [0.09, 0.25])
-def test_stalls_of_the_host_cost_no_distance(stall: float, reports: bool) -> None:
-    assert Drive(Config(sim=FINE), reports).error(stall) < 0.005
 
 
 @pytest.mark.parametrize("link", ["plain", "checked", "checked with counts"])
@@ -218,37 +147,6 @@ def test_a_board_that_answered_late_before_loses_little_distance_with_its_replie
     with world.mcu.lost_replies(every):
         world.drive(0.3, seconds=4.0)
         assert world.state.x - begun == pytest.approx(1.2, abs=0.011)
-
-
-@pytest.mark.variations(3)
-@pytest.mark.parametrize(("every", "stall"), [(0.7, 0.05), (2.0, 0.09), (0.7, 0.15)])
-def test_an_adapter_that_batches_and_stalls_costs_a_reporting_mcu_nothing(
-    every: float, stall: float
-) -> None:
-    drive = Drive(Config(sim=FINE), reports=True, batched=True)
-    drive.faults.enter_context(drive.world.mcu.stalls(every, stall))
-    assert drive.error() <= 1.05 * drive.floor + 0.0005
-
-
-@pytest.mark.variations(2)
-@pytest.mark.parametrize(("every", "stall"), [(2.0, 0.12), (1.0, 0.09), (1.0, 0.15), (2.0, 0.09)])
-def test_an_adapter_that_batches_and_stalls_costs_a_prompted_mcu_little(
-    every: float, stall: float
-) -> None:
-    """The serial adapter delivers replies in batches and stalls, and the pose error is small.
-
-    Each stall loses the link, and some answers seem to arrive before they are due.
-    """
-    drive = Drive(Config(sim=FINE), reports=False, batched=True)
-    drive.faults.enter_context(drive.world.mcu.stalls(every, stall))
-    assert drive.error() < 0.016
-
-
-@pytest.mark.slow
-def test_with_the_mcu_s_counts_bursts_of_lost_lines_cost_nothing() -> None:
-    mcu = McuConfig(link_check="on", encoder_counts=COUNTS)
-    config = Config(sim=SimConfig(encoder_counts=COUNTS), mcu=mcu)
-    assert Drive(config, reports=False).error(lost=0.3) < 0.01
 
 
 @pytest.mark.variations(24)

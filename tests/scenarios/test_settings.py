@@ -2,21 +2,16 @@
 
 from __future__ import annotations
 
-import sys
 from itertools import pairwise
 
 import msgspec
 import pytest
 
-from acsard.core.config.parsing import parse
 from acsard.core.config.settings import Config, LimitsConfig
 from acsard.core.incoming.queries import Query
 from acsard.core.messages.schema import ServiceReply
 from acsard.core.messages.signature import public_name
-from acsard.core.values import NS_PER_S, Instant, Plain
-from acsard.daemon.control_loop import Step
-from acsard.daemon.pacing import NO_PERIOD, Period
-from tests.each import each
+from acsard.core.values import NS_PER_S, Plain
 from tests.scenarios.world import World
 from tests.stepped import Outputs
 
@@ -129,46 +124,3 @@ def test_a_rate_is_in_force_from_the_next_message_on(world: World) -> None:
     world.run(2.0)
     messages = world.bus.published["odom"]
     assert 19 <= len(messages) <= 21
-
-
-def calls_of_longest_step(world: World, service: str, payload: bytes) -> int:
-    """Call a service, and return the largest number of function calls of a step meanwhile."""
-    step, counts = world.loop.step, list[int]()
-
-    def count(frame: object, event: str, argument: object) -> None:
-        counts[-1] += event in ("call", "c_call")
-
-    def counted(now: Instant, period: Period = NO_PERIOD) -> Step:
-        counts.append(0)
-        sys.setprofile(count)
-        try:
-            return step(now, period)
-        finally:
-            sys.setprofile(None)
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(world.loop, "step", counted)
-        world.call(service, payload)
-    return max(counts)
-
-
-@each(
-    "settings",
-    [
-        {"limits.linear_speed": 0.4},
-        {"limits.linear_jerk": 2.0, "odometry.yaw_variance_per_radian": 0.5, "rates.odom": 10.0},
-        {"commands.sources.nav.timeout": 0.5},
-        {"limits.linear_speed": 0.9, "mcu.port": "/dev/x"},
-        {"limits.linear_speed": -1.0},
-    ],
-)
-def test_a_set_costs_no_period(settings: dict[str, Plain]) -> None:
-    # Counted, because a time depends on the load of the machine. With 500 calls more than the step
-    # of a `set_pose`, a step takes 0.2 ms longer.
-    payload = msgspec.json.encode({"settings": settings})
-    for _ in range(2):  # the first world's calls fill caches
-        world = World(parse(b""))
-        world.run(0.2)
-        pose = calls_of_longest_step(world, "set_pose", b'{"x": 1.0}')
-        changed = calls_of_longest_step(world, "set", payload)
-    assert changed < pose + 500

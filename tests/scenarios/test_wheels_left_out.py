@@ -99,20 +99,6 @@ def test_with_one_wheel_fault_the_pose_stays_right_and_state_names_the_wheel(
     assert any(f"{WHEELS[wheel]} wheel is left out" in report for report in reports)
 
 
-@pytest.mark.parametrize("up", [0.3, pytest.param(0.5, marks=SLOW)])
-def test_a_reversed_motor_on_a_bad_cable_is_found(up: float) -> None:
-    """The link is lost again and again, before the evidence of one time is enough."""
-    made = world()
-    made.drive(0.0, seconds=0.2)
-    with made.mcu.reversed_motor(0):
-        for _ in range(5):
-            made.hold(0.3, seconds=up)
-            with made.mcu.mute():
-                made.hold(0.3, seconds=0.15)
-    assert made.state.mode == "fault"
-    assert made.state.reason.startswith("front_right wheel does not obey its command")
-
-
 @SLOW
 def test_with_a_gyro_and_a_wheel_fault_heading_and_distance_stay_right() -> None:
     made = world(ImperfectGyro(bias=0.01), SimConfig(track_multiplier=1.6))
