@@ -81,6 +81,7 @@ def silence(plan: Plan, dice: random.Random, driver: Sender) -> None:
         if hour:
             plan["seconds"] = round(at + 10.0, 1)
             driver["to"] = plan["seconds"]
+            break
         at += dice.uniform(2.0, 4.0)
     driver["phases"] = phases
 
