@@ -157,6 +157,11 @@ def test_lines_are_counted_and_refused_ones_by_reason() -> None:
     assert (counters["lines"], counters["line_malformed"]) == (7, 2)
     assert (counters["lines_sent"], counters["lines_superseded"]) == (5, 1)
     assert "line_too_long" not in counters
+    for step in range(64):  # now and then one count of a hundred per turn
+        rig.reply = rig.codec.encode(WheelSpeeds(*[6.28 * (step % 2)] * 4))
+        rig.step()
+    assert 0 < rig.counters["coarse_encoder_lines"] < 64
+    assert "coarse_encoder_lines" not in counters
 
 
 def test_a_lost_link_is_counted_and_whether_this_computer_was_late() -> None:
