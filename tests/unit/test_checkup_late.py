@@ -6,17 +6,21 @@ from typing import Any
 
 import pytest
 
+from acsard.checkup import procedure
+from acsard.checkup.findings import Finding
 from acsard.checkup.lateness import (
     MAX_LATENESS_S,
     MAX_PAUSE_S,
     is_doubtful,
 )
 from acsard.checkup.outcomes import TimingFinding, find
+from acsard.core.simulator import protocol
 from tests.each import each
 from tests.unit.checkup_robots import (
     MS,
     Busy,
     Checked,
+    Nobody,
     Starved,
     check,
 )
@@ -104,6 +108,40 @@ def test_no_motor_is_turned_again_after_a_silence() -> None:
         assert "watchdog" not in [finding.name for finding in checked.findings]
     assert turned[0] == turned[1]
     assert verdicts == ["FAIL", "WARN"]
+
+
+def test_a_later_step_reports_a_fault_that_an_earlier_step_could_not_judge() -> None:
+    class Refuses(Busy):
+        """A robot that ignores lines without a comma, on a computer that is late in one step."""
+
+        looked = False
+
+        def wakes_late(self) -> bool:
+            return self.looked and super().wakes_late()
+
+    def obeys(line: bytes) -> protocol.Command | None:
+        command = None if b"#" in line else protocol.reference(line)
+        if command and not line.endswith(b",\r\n"):
+            if robot.looked:
+                return None
+            if not command.values[3]:
+                command.values.pop(3)
+        return command
+
+    class Sees(Nobody):
+        def doing(self, text: str) -> None:
+            if "runs again" not in text:
+                robot.looked = text.startswith("testing whether lines")
+
+    robot = Refuses("plain_only", late_s=0.05, every=3)
+    robot.mcu.understand = obeys
+    findings: list[Finding] = []
+    with robot.faulty():
+        robot.mcu.understand = obeys
+        procedure.run(robot, Sees(), robot.config, findings.append)
+    matches = [finding for finding in findings if finding.name == "trailing comma"]
+    assert [finding.figure for finding in matches] == ["not judged", "needed"]
+    assert matches[1].keys == {"mcu.trailing_comma": True}
 
 
 @each(

@@ -9,11 +9,11 @@ import pytest
 
 from acsard.checkup import checkup_report, lateness
 from acsard.checkup.checkup_report import report, summary
-from acsard.checkup.findings import SKIPPED_STEPS, Finding
+from acsard.checkup.findings import SKIPPED_STEPS, Finding, motor_name, wheel_of
 from acsard.checkup.motion import MAX_WATCHDOG_S
 from acsard.checkup.outcomes import OUTCOMES, OUTCOMES_BY_NAME, find
 from acsard.core.config.contradictions import contradictions
-from acsard.core.config.settings import Config
+from acsard.core.config.settings import Config, McuConfig, WheelMap
 from acsard.core.link.link_state import WATCHDOG_S
 from tests.each import each
 from tests.unit.checkup_robots import configured
@@ -122,3 +122,10 @@ def test_the_advised_watchdog_time_is_that_of_the_contract() -> None:
     text = " ".join(part for entry in entries for part in (entry.text, entry.mend))
     times = {f"{1000 * seconds:g}" for seconds in (WATCHDOG_S, MAX_WATCHDOG_S)}
     assert set(re.findall(r"(\d+) ms", text)) == times
+
+
+def test_the_wheel_and_sign_of_a_motor_are_the_configured_ones() -> None:
+    turned = McuConfig(wheels=WheelMap("-c", "+d", "-a", "+b"))
+    wheels = [("rear_left", -1), ("rear_right", 1), ("front_right", -1), ("front_left", 1)]
+    assert [wheel_of(turned, motor) for motor in range(4)] == wheels
+    assert motor_name(turned, 0) == "motor a (rear left)"
