@@ -163,11 +163,6 @@ def test_the_error_names_a_host_that_does_not_resolve(tls: Path) -> None:
     assert "the name no.such.host.invalid does not resolve" in str(error)
 
 
-def test_the_error_says_that_no_program_listens_on_the_port(tls: Path) -> None:
-    endpoint = free_tls_endpoint()
-    assert "no program listens on port" in str(connection_error(endpoint, str(tls / "client")))
-
-
 def test_the_error_says_that_the_server_does_not_speak_tls(tls: Path) -> None:
     with socket.create_server(("127.0.0.1", 0)) as server:
         endpoint = f"tls/127.0.0.1:{server.getsockname()[1]}"

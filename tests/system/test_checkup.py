@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import pty
 import signal
 import tomllib
 from pathlib import Path
@@ -78,17 +76,6 @@ def opened(path: Path) -> serial.Serial | None:
         return open_raw(str(path), 115200)
     except OSError:
         return None
-
-
-def test_yes_alone_is_refused_on_a_pty_that_is_not_the_simulator_s() -> None:
-    ends = pty.openpty()
-    try:
-        ended = typed("mcu", "check", "--yes", "--port", os.ttyname(ends[1]))
-    finally:
-        for end in ends:
-            os.close(end)
-    assert (ended.code, ended.out) == (2, "")
-    assert "--wheels-are-lifted" in ended.err
 
 
 def answer(terminal: Terminal, question: str, word: str, times: int, within: float) -> None:
@@ -166,15 +153,3 @@ def test_a_signal_while_a_wheel_turns_ends_in_zeros(tmp_path: Path, number: sign
         assert "sends zero speeds" in program.stderr
         assert "Traceback" not in program.stderr
         assert peer.lines[-1].line[:31] == zeros
-
-
-@pytest.mark.network
-def test_a_port_that_is_lost_while_a_wheel_turns_is_a_finding(tmp_path: Path) -> None:
-    with Program(acsard("sim"), tmp_path) as sim:
-        port = sim.says("acsard run --port").split()[-1]
-        with Program(acsard("mcu", "check", "--port", port, "--yes"), tmp_path) as check:
-            check.says("checked link")
-            sim.process.kill()
-            assert check.ended(10.0) == 1
-        assert "FAIL    serial line" in check.stdout
-        assert "Traceback" not in check.stderr

@@ -5,13 +5,10 @@ from __future__ import annotations
 import asyncio
 import json
 import math
-import re
-import signal
 import sys
 import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
@@ -19,8 +16,6 @@ import pytest
 import zenoh
 
 from acsard.client import connect, connect_async, connection
-from acsard.client.connection import Connection
-from acsard.client.ride import OPEN_TIMEOUT_S
 from acsard.core.messages import schema
 from acsard.core.messages.refusals import BUSY_ENCODING
 from acsard.host.errors import (
@@ -36,8 +31,6 @@ from tests.system.harness import (
     ROOT,
     Bus,
     Daemon,
-    Tables,
-    client_config,
     finish,
     free_endpoint,
     until,
@@ -165,24 +158,6 @@ def test_an_invalid_address_raises_a_value_error(endpoint: str, robot_id: str, w
     assert isinstance(error.value, ValueError)
 
 
-@pytest.mark.slow
-def test_a_drive_of_a_stopped_robot_raises_the_daemon_s_reason(shared: Daemon, fresh: Bus) -> None:
-    with connect(shared.endpoint) as robot:
-        robot.call("stop")
-        with pytest.raises(NotDrivenError, match=f"stopped by {robot.name}"):
-            robot.drive(0.5, seconds=0.2)
-        numbers = [cause.number for cause in robot.get("state").causes]
-        robot.call("stop")
-        assert not robot.call("clear", numbers=numbers).success
-        assert robot.call("clear").success
-        robot.call("deactivate")
-        with pytest.raises(NotDrivenError, match="acsard call activate"):
-            robot.drive(0.5, seconds=0.2)
-        robot.call("activate")
-        robot.drive(0.5, seconds=0.2)
-        assert robot.pose().x > 0.02
-
-
 def test_a_drive_that_is_stopped_on_its_way_raises_and_does_not_go_on(
     shared: Daemon, fresh: Bus
 ) -> None:
@@ -216,88 +191,6 @@ def test_move_and_turn_end_within_five_millimetres_and_half_a_degree(
     assert pose.x == pytest.approx(0.2, abs=0.005 + 0.02 * late)
     assert pose.y == pytest.approx(0.1, abs=0.005 + 0.02 * late)
     assert math.degrees(pose.yaw) == pytest.approx(0.0, abs=1.0 + 3.0 * late)
-
-
-@pytest.mark.slow
-def test_a_drive_raises_and_names_the_sender_while_another_commander_drives(
-    shared: Daemon, fresh: Bus
-) -> None:
-    with (
-        connect(shared.endpoint) as first,
-        connect(shared.endpoint) as robot,
-        ThreadPoolExecutor(1) as other,
-    ):
-        # The second would drive if the first ended within this time.
-        driving = other.submit(lambda: first.drive(0.1, seconds=OPEN_TIMEOUT_S + 3.0))
-        until(lambda: (fresh.state()["linear"] or 0.0) > 0.05, 5.0, "the first drives")
-        with pytest.raises(NotDrivenError, match=re.escape(first._connection.sender)):
-            robot.drive(0.5, seconds=0.2)
-        driving.result()
-
-
-@pytest.mark.slow
-def test_a_drive_of_a_robot_that_dies_behind_a_router_with_storages_raises(tmp_path: Path) -> None:
-    endpoint, last = free_endpoint(), list[zenoh.Sample]()
-
-    def answer(query: zenoh.Query) -> None:
-        answered.append(True)
-        for item in last[-1:]:
-            query.reply(
-                item.key_expr, item.payload, encoding=item.encoding, timestamp=item.timestamp
-            )
-
-    answered: list[bool] = []
-    with ExitStack() as stack:
-        router = stack.enter_context(zenoh.open(client_config(endpoint, "router")))
-        handles: list[Any] = [
-            router.declare_subscriber("acsard/acsar/state", last.append),
-            router.declare_queryable("acsard/acsar/state", answer),
-        ]
-        listen: Tables = {"bus": {"listen": [free_endpoint()], "connect": [endpoint]}}
-        daemon = stack.enter_context(Daemon(tmp_path, config=listen))
-        until(lambda: bool(last), 10.0, "connected")
-        robot, bus = stack.enter_context(connect(endpoint)), stack.enter_context(Bus(endpoint))
-
-        def kill() -> None:
-            until(lambda: (bus.state()["linear"] or 0.0) > 0.1, 10.0, "driving")
-            daemon.signal(signal.SIGKILL)
-
-        killing = stack.enter_context(ThreadPoolExecutor(1)).submit(kill)
-        with pytest.raises(NoAnswerError, match="nothing received from the daemon"):
-            robot.drive(0.3, seconds=4.0)
-        killing.result()
-        assert answered
-        for item in handles:
-            item.undeclare()
-
-
-async def test_a_zero_sent_right_after_a_command_is_not_lost(shared: Daemon, fresh: Bus) -> None:
-    # A drive may be cancelled just after it sent a command. The bus drops commands of one key that
-    # come faster than 1000 Hz, also because the receiver was busy and handles them in a row. Then
-    # the robot would drive on for its timeout, so the zero is repeated.
-    sent: list[float] = []
-    original = Connection._put
-
-    def put(self: Connection, linear: float, angular: float, echo: schema.Beat) -> None:
-        original(self, linear, angular, echo)
-        sent.append(linear)
-
-    with pytest.MonkeyPatch.context() as patch, fresh.follow("cmd/app") as commands:
-        patch.setattr(Connection, "_put", put)
-        async with connect_async(shared.endpoint) as robot:
-            driving = asyncio.create_task(robot.drive(0.2, seconds=60.0))
-            # Send the opening zero, the pause, and the first command, in one step of the loop.
-            await asyncio.sleep(0)
-            while 0.2 not in sent:
-                await asyncio.sleep(0)
-            driving.cancel()
-            with pytest.raises(asyncio.CancelledError):
-                await driving
-            zeros = sent[::-1].index(0.2)
-            assert zeros >= 2
-            await robot.get("info")
-        fresh.get("info")  # after everything that was sent: the command itself may be dropped
-        until(lambda: commands.seen[-1].value["linear"]["x"] == 0.0, 1.0, "a last zero")
 
 
 def test_the_client_repeats_a_query_to_a_busy_daemon_and_never_a_service_call() -> None:

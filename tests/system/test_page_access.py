@@ -8,7 +8,7 @@ import re
 import socket
 import ssl
 import time
-from contextlib import AsyncExitStack, suppress
+from contextlib import suppress
 
 import aiohttp
 import pytest
@@ -17,7 +17,6 @@ import websockets
 from acsard.bus.tls_files import peer_ends_ns
 from acsard.core.values import ROLES, Role
 from acsard.machine.authority import Authority
-from acsard.web.connections import MAX_OF_TOKEN
 from acsard.web.page_server import TICK_S
 from tests.system.browser import NAME, Page, hands
 from tests.system.bystander import lost
@@ -124,55 +123,6 @@ async def test_a_link_with_fewer_permissions_replaces_a_cookie_only_if_asked_to(
         assert await opens("viewer", replace=True) == (303, "viewer")
         page.vault.revoke("my-viewer")
         assert await opens("operator") == (303, "operator")
-
-
-async def test_a_connection_whose_token_was_revoked_is_cut_and_others_are_not(page: Page) -> None:
-    names = [f"{name}-{time.time_ns()}" for name in ("borrowed", "owned")]
-    tokens = [page.invite("viewer", name) for name in names]
-    port = int(page.away.rpartition(":")[2])
-    trusted = ssl.create_default_context(cafile=str(page.tls / "ca.pem"))
-
-    async def opened(token: str) -> tuple[asyncio.StreamReader, asyncio.StreamWriter]:
-        """Open a connection that has shown its token and has sent a part of its next request."""
-        reader, writer = await asyncio.open_connection(
-            "127.0.0.1", port, ssl=trusted, server_hostname=NAME
-        )
-        head = f"Host: {NAME}:{port}\r\nAuthorization: Bearer {token}\r\n"
-        writer.write(f"GET /api/whoami HTTP/1.1\r\n{head}\r\nGET /api/whoami".encode())
-        assert b" 200 " in await reader.readline()
-        await reader.readuntil(b"}")
-        return reader, writer
-
-    (borrowed, first), (owned, second) = [await opened(secret) for secret in tokens]
-    page.vault.revoke(names[0])
-    with suppress(ConnectionError):
-        assert await asyncio.wait_for(borrowed.read(), 3 * TICK_S + PATIENCE_S) == b""
-    with pytest.raises(TimeoutError):
-        await asyncio.wait_for(owned.read(1), 2 * TICK_S)
-    for writer in (first, second):
-        writer.transport.abort()
-
-
-async def test_a_token_has_few_connections_and_still_stops_beyond_them(
-    page: Page, bus: Bus
-) -> None:
-    names = [f"{name}-{time.time_ns()}" for name in ("broken", "phone")]
-    broken, phone = [page.invite("viewer", name) for name in names]
-    counted = page.refused().get("too_many", 0)
-    async with AsyncExitStack() as stack:
-        session = await stack.enter_async_context(page.client(broken))
-        for _ in range(MAX_OF_TOKEN):
-            await stack.enter_async_context(session.ws_connect(f"{page.away}/ws"))
-        with pytest.raises(aiohttp.WSServerHandshakeError) as caught:
-            await session.ws_connect(f"{page.away}/ws")
-        assert caught.value.status == 503
-        async with session.get(f"{page.away}/api/whoami") as answer:
-            assert "close some" in (await answer.json())["error"]
-        async with session.post(f"{page.away}/api/srv/stop") as answer:
-            assert (await answer.json())["success"]
-        theirs = await stack.enter_async_context(hands(page, phone))
-        assert (await theirs.call("stop"))["ok"]
-    assert page.refused()["too_many"] == counted + 2
 
 
 def test_a_client_that_leaves_before_the_end_of_its_body_leaves_no_traceback(

@@ -103,25 +103,6 @@ async def test_a_stop_passes_a_flood_of_its_own_connection(page: Page, bus: Bus)
         )
 
 
-async def test_programs_query_call_and_list_the_interface(page: Page, bus: Bus) -> None:
-    async with aiohttp.ClientSession(page.here) as session:
-        async with session.get("/api/state") as answer:
-            assert (await answer.json())["mode"] == "ready"
-        async with session.post("/api/srv/stop") as answer:
-            assert (answer.status, (await answer.json())["success"]) == (200, True)
-        async with session.post("/api/srv/clear") as answer:
-            assert answer.status == 409
-        async with session.get("/api/state") as answer:
-            numbers = [cause["number"] for cause in (await answer.json())["causes"]]
-        async with session.post("/api/srv/clear", json={"numbers": numbers}) as answer:
-            assert answer.status == 200
-        wish = {"settings": {"limits.linear_speed": 99.0}}
-        async with session.post("/api/srv/set", json=wish) as answer:
-            assert (answer.status, (await answer.json())["success"]) == (409, False)
-        async with session.get("/api") as answer:
-            assert (await answer.json())["openapi"] == "3.1.0"
-
-
 TYPED = ("/api/state", "/api/whoami", "/api/settings", "/api/recordings", "/api/info")
 """Some paths with a type of their own, which not any JSON fits."""
 
