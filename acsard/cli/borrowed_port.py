@@ -6,6 +6,7 @@ import os
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from typing import Self
 
 from acsard.bus.address import address_of
 from acsard.bus.zenoh_sessions import answers
@@ -19,42 +20,40 @@ from acsard.host.processes import holder_of, is_daemon_here
 
 CLOSE_TIMEOUT_S = 3.0  # for the daemon to close the port
 
+NEUTRAL = "each sender must send a zero first"
+OUTDATED = (
+    "the robot stays switched off, because the daemon has the configuration of before: restart the "
+    "daemon, then type `acsard call activate`"
+)
 
-class BorrowedPort(BlockingPort):
-    """A port that the daemon closes until the end. `tell` shows a text to the operator."""
+
+class Loan:
+    """The daemon closes its port until the end. `tell` shows a text to the operator."""
 
     def __init__(self, config: Config, tell: Callable[[str], None]) -> None:
-        super().__init__(config.mcu.port)
         self._where, self._port, self._tell = address_of(config), config.mcu.port, tell
         self._latched: tuple[int, ...] | None = None  # by the daemon; None: nothing is borrowed
+        self.outdated = False  # the daemon's wheels: the file has others now
 
-    def open(self, baud_rate: int) -> None:
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        numbers, self._latched = self._latched, None
+        if numbers is None:
+            return
         try:
-            super().open(baud_rate)
-        except InUseError as error:
-            self._borrow(error)
-            self._open_soon(baud_rate)
+            with open_connection(self._where) as robot:
+                # The port opens also if the call is refused: it names no cause of a robot that was
+                # off before, or whose wheels are outdated.
+                robot.call("activate", numbers=[] if self.outdated else list(numbers))
+        except AcsardError as error:
+            self._tell(f"the daemon did not take the port back ({error}): `acsard call activate`")
+        else:
+            self._tell(f"the daemon has the port again; {OUTDATED if self.outdated else NEUTRAL}")
 
-    def close(self) -> None:
-        try:
-            super().close()
-        finally:
-            self._give_back()
-
-    def _open_soon(self, baud_rate: int) -> None:
-        end_s = clock.steady_s() + CLOSE_TIMEOUT_S
-        while True:
-            try:
-                super().open(baud_rate)
-            except InUseError:
-                if clock.steady_s() > end_s:
-                    self._give_back()
-                    raise
-                time.sleep(0.05)
-            else:
-                return
-
-    def _borrow(self, in_use: InUseError) -> None:
+    def begin(self, in_use: InUseError) -> None:
+        """Ask the daemon to lend the port. Raises `InUseError` if it does not."""
         with self._daemon(in_use) as robot:
             info = robot.get("info")
             ours = is_daemon_here(info.pid) and _device(info.port) == _device(self._port)
@@ -67,20 +66,6 @@ class BorrowedPort(BlockingPort):
         self._latched = tuple(reply.data.numbers)
         self._tell("the daemon has switched the robot off, and lends the port for this check")
 
-    def _give_back(self) -> None:
-        numbers, self._latched = self._latched, None
-        if numbers is None:
-            return
-        try:
-            with open_connection(self._where) as robot:
-                # A robot that was switched off before the check stays so: it refuses this call, but
-                # opens the port.
-                robot.call("activate", numbers=list(numbers))
-        except AcsardError as error:
-            self._tell(f"the daemon did not take the port back ({error}): `acsard call activate`")
-        else:
-            self._tell("the daemon has the port again; each sender must send a zero first")
-
     @contextmanager
     def _daemon(self, in_use: InUseError) -> Iterator[Connection]:
         if not answers(self._where.endpoint):
@@ -92,6 +77,33 @@ class BorrowedPort(BlockingPort):
             raise
         except AcsardError as error:
             raise InUseError(f"{in_use}; the daemon did not lend it: {error}") from None
+
+
+class BorrowedPort(BlockingPort):
+    """A port that the daemon lends if it has the port open."""
+
+    def __init__(self, path: str, loan: Loan) -> None:
+        super().__init__(path)
+        self._loan = loan
+
+    def open(self, baud_rate: int) -> None:
+        try:
+            super().open(baud_rate)
+        except InUseError as error:
+            self._loan.begin(error)
+            self._open_soon(baud_rate)
+
+    def _open_soon(self, baud_rate: int) -> None:
+        end_s = clock.steady_s() + CLOSE_TIMEOUT_S
+        while True:
+            try:
+                super().open(baud_rate)
+            except InUseError:
+                if clock.steady_s() > end_s:
+                    raise
+                time.sleep(0.05)
+            else:
+                return
 
 
 def _device(path: str) -> str:

@@ -12,9 +12,9 @@ import msgspec
 
 from acsard.checkup import procedure
 from acsard.checkup.board import Wire
-from acsard.checkup.checkup_report import changes, report, summary, withheld
+from acsard.checkup.checkup_report import Changes, changes, report, summary, withheld
 from acsard.checkup.findings import Finding
-from acsard.cli.borrowed_port import BorrowedPort
+from acsard.cli.borrowed_port import BorrowedPort, Loan
 from acsard.cli.common import add_config, add_outcome, add_port, load
 from acsard.core.config.settings import SIMULATOR, Config
 from acsard.core.simulator.fake_mcu import FakeMcu
@@ -94,30 +94,33 @@ def _checked(
     words = " (the built-in SIMULATOR, in simulated time)" if simulated else ""
     prompt.begin(f"port {port}{words}, configuration {where}")
     trouble: MendableError | None = None
-    try:
-        with (
-            ended_by_signals(
-                "stopping: acsard sends zero speeds to the board, then closes the port", exits=True
-            ),
-            single_key_mode() if isinstance(prompt, TerminalPrompt) else nullcontext(),
-        ):
-            procedure.run(_wire(config, prompt), prompt, config, report_finding, clock.asleep_ns)
-    except MendableError as error:
-        if not args.json:
-            raise
-        # With --json, print the report before the error.
-        trouble = error
-    named = args.port if args.write else ""
     why = withheld(simulated, configured)
-    found_changes = {} if why else changes(findings, configured, named)
+    found_changes: Changes = {}
     written = ""
-    if args.write and found_changes and not trouble:
+    with (
+        ended_by_signals(
+            "stopping: acsard sends zero speeds to the board, then closes the port", exits=True
+        ),
+        single_key_mode() if isinstance(prompt, TerminalPrompt) else nullcontext(),
+        Loan(config, prompt.show_text) as loan,
+    ):
         try:
-            change(Path(where), found_changes)
-            written = where
+            procedure.run(_wire(config, loan), prompt, config, report_finding, clock.asleep_ns)
         except MendableError as error:
-            # Print the findings of the long check before the error.
+            if not args.json:
+                raise
+            # With --json, print the report before the error.
             trouble = error
+        if not why:
+            found_changes = changes(findings, configured, args.port if args.write else "")
+        if args.write and found_changes and not trouble:
+            loan.outdated = True  # before the change: a signal may end the check after it
+            try:
+                change(Path(where), found_changes)
+                written = where
+            except MendableError as error:
+                # Print the findings of the long check before the error.
+                trouble, loan.outdated = error, False
     result = report(port, findings, found_changes, written, str(trouble or ""), why)
     prompt.result(msgspec.json.encode(result).decode() if args.json else summary(result, where))
     if trouble is not None:
@@ -153,7 +156,7 @@ def _prompt(args: argparse.Namespace, port: str) -> Prompt:
     return Prompt(args.json)
 
 
-def _wire(config: Config, prompt: Prompt) -> Wire:
+def _wire(config: Config, loan: Loan) -> Wire:
     if config.mcu.port == SIMULATOR:
         return VirtualWire(FakeMcu(config))
-    return BorrowedPort(config, prompt.show_text)
+    return BorrowedPort(config.mcu.port, loan)

@@ -12,16 +12,22 @@ import sys
 import termios
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
+from unittest.mock import MagicMock
 
 import pytest
 from msgspec import structs
 
-from acsard.cli import mcu, parser
+from acsard.checkup import procedure
+from acsard.checkup.findings import Finding
+from acsard.cli import borrowed_port, mcu, parser
+from acsard.cli.borrowed_port import BorrowedPort
 from acsard.core.config.parsing import parse
 from acsard.core.config.settings import Config
+from acsard.core.messages import schema
 from acsard.core.simulator.fake_mcu import FakeMcu
 from acsard.core.simulator.virtual_wire import VirtualWire
-from acsard.host.errors import Exit, MendableError, NoPortError, UsageError
+from acsard.host.errors import Exit, InUseError, MendableError, NoPortError, UsageError
 from acsard.terminal.prompt import ended_by_signals
 
 
@@ -103,6 +109,35 @@ def test_the_port_that_was_named_is_written_with_the_rate_it_has(
     assert json.loads(capsys.readouterr().out)["changes"]["mcu.port"] == "/dev/acsar_mcu"
     written = parse((tmp_path / "acsard.toml").read_bytes()).mcu
     assert (written.port, written.baud_rate) == ("/dev/acsar_mcu", 57600)
+
+
+@pytest.mark.parametrize(("words", "released"), [((), [7]), (("--write",), [])])
+def test_a_robot_whose_file_the_check_changed_stays_switched_off(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch,
+    words: tuple[str, ...], released: list[int],
+) -> None:  # fmt: skip
+    """Its daemon has the wheel map of before until it is restarted."""
+    robot = MagicMock()
+    robot.__enter__.return_value = robot
+    robot.get.return_value = SimpleNamespace(pid=os.getpid(), port="/dev/none")
+    robot.call.return_value = schema.ServiceReply(
+        success=True, message="", data=schema.ReplyData(numbers=[7])
+    )
+    monkeypatch.setattr(borrowed_port, "answers", lambda _: True)
+    monkeypatch.setattr(borrowed_port, "is_daemon_here", lambda _: True)
+    monkeypatch.setattr(borrowed_port, "open_connection", lambda _: robot)
+
+    def run(
+        wire: BorrowedPort, operator: object, config: Config, tell: Callable[[Finding], None],
+        *_: object,
+    ) -> None:  # fmt: skip
+        wire._loan.begin(InUseError("in use"))
+        tell(Finding("baud rate", "PASS", keys={"mcu.wheels.front_left": "-b"}))
+
+    monkeypatch.setattr(procedure, "run", run)
+    called(tmp_path, "--yes", "--wheels-are-lifted", *words, text="[mcu]\nport = '/dev/none'\n")
+    robot.call.assert_called_with("activate", numbers=released)
+    assert ("restart the daemon" in capsys.readouterr().err) is (not released)
 
 
 def test_a_port_without_an_answer_is_not_written(
