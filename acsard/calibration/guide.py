@@ -72,7 +72,7 @@ def drive(
             f"daemon's version, {info.version}"
         ) from None
     if file:
-        _require_own(config.drive, file_config.drive, file)
+        require_own(config, file_config, file)
     method = options.method or (
         "poses" if options.poses else "gyro" if config.odometry.gyro else "tape"
     )
@@ -113,7 +113,15 @@ def drive(
             raise LogError("the operator ended the drive") from None
 
 
-def _require_own(ours: DriveConfig, theirs: DriveConfig, file: str) -> None:
+def require_own(daemon: Config, file_config: Config, file: str) -> None:
+    """Raise `LogError` unless the file describes the robot that the daemon drives."""
+    if daemon.mcu.simulated and not file_config.mcu.simulated:
+        raise LogError(
+            f'the daemon simulates its robot, but {file} has mcu.port = "{file_config.mcu.port}": '
+            "a real robot must not get the values of the simulator. Run the daemon with this port, "
+            'or name a file whose mcu.port is "sim" with --config'
+        )
+    ours, theirs = daemon.drive, file_config.drive
     if (ours.wheel_radius, ours.wheel_separation) != (theirs.wheel_radius, theirs.wheel_separation):
         raise LogError(
             f"the daemon runs with drive.wheel_radius = {ours.wheel_radius:g} and "

@@ -4,18 +4,21 @@ from __future__ import annotations
 
 import cmath
 import math
+from contextlib import nullcontext
+from types import SimpleNamespace
+from unittest.mock import MagicMock
 
 import numpy as np
 import pytest
 from msgspec.structs import replace
 
 from acsard.calibration.fit import Base
-from acsard.calibration.guide import MAX_REPEATS, guided
+from acsard.calibration.guide import MAX_REPEATS, Options, drive, guided, require_own
 from acsard.calibration.leg import require_path
 from acsard.calibration.log import Floats, Log, LogError, Notes, Run, run_of
 from acsard.calibration.plan import FLOOR_M, METHODS, Leg, Move, Setup, legs
 from acsard.calibration.result import calibrate
-from acsard.core.config.parsing import parse
+from acsard.core.config.parsing import effective, parse
 from acsard.core.config.settings import Config
 from acsard.core.values import AcsardError
 from acsard.host.errors import NoAnswerError, NotDrivenError
@@ -23,6 +26,7 @@ from acsard.terminal.prompt import NumberQuestion, Prompt
 
 STEP_S, LINE_M, WHEELBASE_M, WIDTH_M = 0.02, 0.45, 0.25, 0.30
 SETUP = Setup.of(Config())
+REAL = "[mcu]\nport = '/dev/acsar_mcu'\n"
 
 
 class Robot(Prompt):
@@ -216,6 +220,30 @@ def test_distances_that_cannot_be_true_are_measured_again(
     assert [run.tape for run in log.runs[:2]] == [run.tape for run in right.runs[:2]]
     found = calibrate(log, Config(), "the drive").found
     assert found["wheel_separation_multiplier"] == pytest.approx(1.5, rel=0.025)
+
+
+@pytest.mark.parametrize(
+    ("daemon", "file", "words"),
+    [
+        ("", "", ""),
+        (REAL, REAL, ""),
+        ("", REAL, 'mcu.port = "/dev/acsar_mcu"'),
+        ("", "[drive]\nwheel_radius = 0.06\n", "has other values"),
+    ],
+)
+def test_only_the_file_of_the_robot_that_was_driven_gets_its_values(
+    daemon: str, file: str, words: str
+) -> None:
+    configs = parse(daemon.encode()), parse(file.encode())
+    with pytest.raises(LogError, match=words) if words else nullcontext():
+        require_own(*configs, "robot.toml")
+
+
+def test_a_drive_of_the_simulator_for_a_robot_s_file_is_refused_before_it_begins() -> None:
+    client = MagicMock()
+    client.get.side_effect = [SimpleNamespace(simulated=True), effective(Config())]
+    with pytest.raises(LogError, match="must not get the values of the simulator"):
+        drive(client, Options(), Prompt(), "robot.toml", parse(REAL.encode()))
 
 
 @pytest.mark.parametrize(
