@@ -206,8 +206,8 @@ def objection(state: RobotState, source: str, sender: str) -> str:
     if ours is None:
         names = ", ".join(entry.name for entry in state.sources)
         return (
-            f"{source} is not one of commands.sources: {names}; use one of these sources, or add "
-            f"{source} to commands.sources in the robot's acsard.toml and restart the daemon"
+            f"{source} is not one of commands.sources: {names}; add {source} to commands.sources "
+            "in the robot's acsard.toml and restart the daemon"
         )
     if state.mode == "waiting":
         return state.why

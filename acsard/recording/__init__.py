@@ -2,5 +2,5 @@
 
 Recording: `recorder` (the thread), `directory` (which files go) and `file` (frames, records).
 Reading: `replay` (steps and files), `timeline` (what happened, in sentences), `published` (the
-messages of the robot), and from them `export` (MCAP, ROS 2 bag, CSV) and `html_report`.
+messages of the robot), and from them `export` (MCAP, CSV) and `html_report`.
 """

@@ -12,7 +12,7 @@ import time
 
 from acsard.client.connection import Connection
 from acsard.client.driving import Driver
-from acsard.client.ride import GRACE_S, can_drive
+from acsard.client.ride import GRACE_S, refuses_for_good
 from acsard.core.values import REST, Twist
 from acsard.host import clock
 from acsard.top.drive_screen import Teleop
@@ -139,10 +139,11 @@ class KeyboardDrive:
             self._driver.watch,
             self._driver.ride,
         )
-        why = ""
-        if watch.state is not None and now - self._fine > GRACE_S:
+        why, state = "", watch.state
+        if state is not None and now - self._fine > GRACE_S:
             why = ride.objection or ""
-            if ride.ended and can_drive(watch.state):
+            may_follow = state.mode != "waiting" and not refuses_for_good(state, robot.source)
+            if ride.ended and may_follow:
                 why = RELEASE_REASON
         return Teleop(
             robot.where.robot_id,
@@ -150,7 +151,7 @@ class KeyboardDrive:
             robot.source,
             self._keyboard.linear,
             self._keyboard.angular,
-            watch.state,
+            state,
             watch.age(now),
             why,
             watch.silent(now),

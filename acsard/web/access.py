@@ -4,7 +4,7 @@ The checks come in this order: the client's address and the requested host (`cal
 origin of the web page that sent the request, the token, the token's connections and request rate,
 and the client's role. A path that does not exist requires a token too, so a client without a token
 does not learn which paths exist. No check waits for a disk: the tokens are those of the last
-reading of the file, which `server.py` repeats each second.
+reading of the file, which `page_server.py` repeats each second.
 """
 
 from __future__ import annotations

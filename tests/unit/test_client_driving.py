@@ -205,7 +205,7 @@ AGAINST: list[tuple[str, Says, type[Exception], str, float, bool]] = [
     ("switched off", after(0, replace(STOPPED, mode="inactive", reason="switched off")),
      NotDrivenError, "switched off", SETTLED_S, False),
     ("unlisted", after(0, replace(FOLLOWED, sources=[source(name="nav")])), NotDrivenError,
-     "app is not one of commands.sources: nav; use one of these sources, or add app",
+     "app is not one of commands.sources: nav; add app",
      SETTLED_S, False),
     ("no link", after(0, replace(STOPPED, mode="waiting", reason="waiting for the first lines")),
      NotDrivenError, "first lines", OPEN_TIMEOUT_S, False),

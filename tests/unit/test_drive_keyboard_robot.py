@@ -219,6 +219,9 @@ def test_the_operator_is_told_why_keys_have_no_effect_and_what_a_held_key_needs(
     assert "press space, then press the key again" in RELEASE_REASON
     drive.step(" ")
     assert drive.objection == ""
+    drive.robot.shows = replace(FOLLOWED, mode="ready", source="", sources=[])
+    drive.step("i", times=20)
+    assert "is not one of commands.sources" in drive.objection
 
 
 # the last report

@@ -77,12 +77,13 @@ def _table(text: bytes) -> dict[str, Any]:
 
 def _repeated(toml: str, error: str) -> str:
     # tomllib names the second place only. The last line before it with the same name is the first.
+    # Of a value of several lines, tomllib names the last line, which has no name.
     if "twice" not in error and "overwrite" not in error:
         return ""
     number = re.search(r"line (\d+)", error)
     lines = toml.rstrip().split("\n")[: int(number[1]) if number else None]
     *before, name = (line.split("#")[0].split("=")[0].strip() for line in lines)
-    if name not in before:
+    if name not in before or not (name[0] == "[" or "=" in lines[-1]):
         return ""
     first = len(before) - before[::-1].index(name)
     return f"line {len(lines)} repeats {name}, which is at line {first} already: change it there"
