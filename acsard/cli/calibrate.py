@@ -16,10 +16,10 @@ import msgspec
 from msgspec.structs import replace
 
 from acsard.bus.address import address_of
-from acsard.calibration.guide import MIN_TAPE_M, SOURCE, Options, drive
+from acsard.calibration.guide import MIN_TAPE_M, SOURCE, Options, drive, require_own
 from acsard.calibration.log import Log, LogError, read_file, with_distance
 from acsard.calibration.plan import METHODS
-from acsard.calibration.result import Refusal, calibrate, text
+from acsard.calibration.result import Refusal, Result, calibrate, text
 from acsard.cli.common import add_config, add_outcome, load
 from acsard.cli.robot_options import add_bus, require_one
 from acsard.client.connection import open_connection
@@ -35,7 +35,8 @@ from acsard.terminal.prompt import NobodyError, Prompt, TerminalPrompt, ended_by
 DRIVE = """\
 Drive the robot, and guide a person at this terminal. The person stands near the robot on a free
 floor of 3 m x 3 m, starts each leg with Enter, stops it with any key, and types the distances that
-the tool asks for. The tool says first for how long the robot drives at most.
+the tool asks for. The tool says first for how long the robot drives at most. At the end it asks
+whether to write the result.
 """
 
 LOG = """\
@@ -133,7 +134,8 @@ def main_log(args: argparse.Namespace) -> int:
             made = read_file(args.file)
         return with_distance(made, *args.distance) if args.distance else made, config
 
-    return _finished(args, where, str(args.file), log)
+    _finished(args, where, str(args.file), log)
+    return Exit.OK
 
 
 def main_drive(args: argparse.Namespace) -> int:
@@ -166,15 +168,34 @@ def main_drive(args: argparse.Namespace) -> int:
         ):
             return drive(client, options, prompt, where if args.write else "", config)
 
-    code = _finished(args, where, "the drive", driven)
-    if args.write:
+    result, used = _finished(args, where, "the drive", driven)
+    asks = not (args.write or args.yes or args.json)
+    if args.write or (asks and _written(args.config, where, config, result, used)):
         print("restart the daemon: it uses the new calibration after a restart", file=sys.stderr)
-    return code
+    return Exit.OK
+
+
+def _written(
+    path: str | None, where: str, file_config: Config, result: Result, used: Config
+) -> bool:
+    # Asks whether to write the result into the file `where`, if this is possible.
+    try:
+        writable(path)
+        require_own(used, file_config, where)
+    except (MendableError, LogError) as error:
+        print(f"\nthe values cannot be written: {error}", file=sys.stderr)
+        return False
+    if TerminalPrompt().ask(f"Write these values into {where}?", ("yes", "no")) == "no":
+        return False
+    change(Path(where), dict(result.settings))
+    print(f"{where}: written")
+    return True
 
 
 def _finished(
     args: argparse.Namespace, where: str, source: str, get: Callable[[], tuple[Log, Config]]
-) -> int:
+) -> tuple[Result, Config]:
+    # Returns the result, and the configuration that was in force.
     try:
         log, config = get()
         with Prompt(args.json) as prompt:
@@ -202,7 +223,7 @@ def _finished(
         show(*text(result, config, where), most=MAX_TEXT_WIDTH)
     if trouble is not None:
         raise trouble
-    return Exit.OK
+    return result, config
 
 
 @contextmanager

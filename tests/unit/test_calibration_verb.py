@@ -6,13 +6,17 @@ import errno
 import json
 import os
 from pathlib import Path
+from unittest.mock import MagicMock
 
 import pytest
 
-from acsard.cli import parser
+from acsard.calibration.log import read
+from acsard.cli import calibrate, parser
 from acsard.core.config.parsing import parse
+from acsard.core.config.settings import Config
 from acsard.host.errors import Exit, MendableError, UnreachableError
 from acsard.terminal.output import MAX_TEXT_WIDTH
+from acsard.terminal.prompt import TerminalPrompt
 from tests.unit.calibration_logs import usual
 
 GOOD = usual().csv(places=False)
@@ -94,6 +98,42 @@ def driving(*words: str) -> int:
     """Return the exit code of a guided `acsard calibrate` with these arguments and no terminal."""
     args = parser(["calibrate"]).parse_args(["calibrate", "drive", *words])
     return int(args.main(args))
+
+
+@pytest.mark.parametrize(
+    ("text", "answer", "says"),
+    [
+        ("# mine\n", "yes", "restart the daemon"),
+        ("# mine\n", "no", ""),
+        ("[mcu]\nport = '/dev/acsar_mcu'\n", "yes", "the values of the simulator"),
+        ("", "yes", "no configuration file"),
+    ],
+)
+def test_after_a_guided_drive_the_person_says_whether_its_result_is_written(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str],
+    text: str, answer: str, says: str,
+) -> None:  # fmt: skip
+    monkeypatch.chdir(tmp_path)
+    file = tmp_path / "acsard.toml"
+    if text:
+        file.write_text(text)
+    questions = []
+
+    def ask(_: TerminalPrompt, question: str, answers: object) -> str:
+        questions.append(question)
+        return answer
+
+    monkeypatch.setattr("sys.stdin", MagicMock())
+    monkeypatch.setattr(TerminalPrompt, "ask", ask)
+    monkeypatch.setattr(calibrate, "open_connection", MagicMock())
+    monkeypatch.setattr(calibrate, "_prompt", MagicMock())
+    monkeypatch.setattr(calibrate, "drive", lambda *_: (read(GOOD.encode()), Config()))
+    assert driving() == 0
+    out, err = capsys.readouterr()
+    assert says in err
+    changed = file.exists() and file.read_text() != text
+    assert changed is ("acsard.toml: written" in out) is (says == "restart the daemon")
+    assert len(questions) == (text == "# mine\n")
 
 
 def test_without_a_daemon_the_verb_ends_as_unreachable(tmp_path: Path) -> None:
