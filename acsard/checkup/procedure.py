@@ -24,7 +24,9 @@ from acsard.checkup import (
     watchdog,
 )
 from acsard.checkup.board import Board, Operator, Wire
-from acsard.checkup.channels import (
+from acsard.checkup.findings import SKIPPED_STEPS, Finding, StoppedError, WireLostError, motor_name
+from acsard.checkup.motion import SHORT_MEASUREMENT_S
+from acsard.checkup.motor_channels import (
     Channel,
     ask_which_wheel,
     channel,
@@ -32,8 +34,6 @@ from acsard.checkup.channels import (
     stands,
     wheel_map,
 )
-from acsard.checkup.findings import SKIPPED_STEPS, Finding, StoppedError, WireLostError, motor_name
-from acsard.checkup.motion import SHORT_MEASUREMENT_S
 from acsard.checkup.outcomes import TimingFinding
 from acsard.checkup.restarts import Restart, RestartedError
 from acsard.core.config.settings import Config, SafetyConfig

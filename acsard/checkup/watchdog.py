@@ -16,9 +16,9 @@ from msgspec import Struct
 
 from acsard.checkup import damage, encoder_counts, motion, outcomes
 from acsard.checkup.board import Board
-from acsard.checkup.channels import run_up
 from acsard.checkup.findings import Finding, StoppedError
 from acsard.checkup.motion import BoardReply
+from acsard.checkup.motor_channels import run_up
 from acsard.core.config.wire_time import FIELD_VALUES
 from acsard.core.link.codec import LETTERS
 from acsard.core.values import Seconds

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import pytest
 
-from acsard.checkup.channels import turn
 from acsard.checkup.findings import StoppedError
 from acsard.checkup.motion import MOTOR_TIMEOUT_S, SPEED, ZERO
+from acsard.checkup.motor_channels import turn
 from acsard.checkup.watchdog import run
 from acsard.core.simulator import protocol
 from tests.unit.checkup_robots import Robot

@@ -10,9 +10,9 @@ import pytest
 
 from acsard.checkup import dialect, encoder_counts, line_loss, watchdog
 from acsard.checkup.board import Board
-from acsard.checkup.channels import turn
 from acsard.checkup.findings import StoppedError
 from acsard.checkup.motion import SPEED, BoardReply
+from acsard.checkup.motor_channels import turn
 from acsard.core.config.settings import Config, SimConfig
 from acsard.core.link.checked_line import Reading
 from acsard.core.simulator import protocol

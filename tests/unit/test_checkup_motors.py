@@ -8,8 +8,8 @@ import pytest
 from msgspec import structs
 
 from acsard.checkup import motion
-from acsard.checkup.channels import Channel, Kind, encoder_finding, probe
 from acsard.checkup.motion import SHORT_MEASUREMENT_S, BoardReply
+from acsard.checkup.motor_channels import Channel, Kind, encoder_finding, probe
 from acsard.core.config.settings import Config, McuConfig, SimConfig
 from acsard.core.link.checked_line import Reading
 from acsard.core.link.codec import Motors
