@@ -90,8 +90,6 @@ class Browser:
         """The target id of the current tab."""
         self.said: list[str] = []
         """Console messages and errors of the page."""
-        self.received = 0
-        """Bytes, of HTTP with its headers and over WebSockets, since `Network.enable`."""
 
     def start(self) -> None:
         """Start the browser, and wait until it accepts commands."""
@@ -173,10 +171,6 @@ class Browser:
                 self.said.append(json.dumps(frame["params"]["exceptionDetails"]))
             elif frame["method"] == "Log.entryAdded":
                 self.said.append(frame["params"]["entry"]["text"])
-            elif frame["method"] == "Network.loadingFinished":
-                self.received += int(frame["params"]["encodedDataLength"])
-            elif frame["method"] == "Network.webSocketFrameReceived":
-                self.received += len(frame["params"]["response"]["payloadData"].encode())
 
     def ask(self, method: str, **params: object) -> Any:
         """Run one command of the DevTools protocol, and return its result."""

@@ -591,11 +591,10 @@ class FarPeer(Program):
         """Return all lines so far, without their ends; "-" is an empty one or a question."""
         return list(self._all())
 
-    def since(self, at: float, to: float = float("inf")) -> list[ReceivedLine]:
-        """Return the lines between two times."""
+    def since(self, at: float) -> list[ReceivedLine]:
+        """Return the lines that came after this time."""
         lines = self._all()
-        first, last = (bisect.bisect_right(lines, time, key=lambda h: h.at) for time in (at, to))
-        return lines[first:last]
+        return lines[bisect.bisect_right(lines, at, key=lambda h: h.at) :]
 
     def _all(self) -> list[ReceivedLine]:
         for text in self.out[1 + len(self._heard) :]:
@@ -846,32 +845,26 @@ class Bus:
         angular: float = 0.0,
         *,
         source: str = "app",
-        neutral: bool = True,
         certificate: str = "",
     ) -> Iterator[Commander]:
-        """Send commands at 20 Hz while the body runs. A zero comes first if `neutral` is set."""
+        """Send commands at 20 Hz while the body runs. A zero comes first."""
         key = "/".join(filter(None, ("cmd", source, certificate)))
         commander = Commander(self, key, linear, angular)
-        if neutral:
-            before, said = self.count("commands"), 0.0
+        before, said = self.count("commands"), 0.0
 
-            def heard() -> bool:
-                nonlocal said
-                # A sender that is stamped on the way, for example by a router, must show its delays
-                # first. A message that arrives within a millisecond of another one is dropped.
-                state = self.state()
-                counters, waits = state["counters"], self._waits_for(state, source)
-                neutral = waits.startswith("send a zero first")
-                if (
-                    neutral
-                    or counters.get("commands_of_new_senders")
-                    or time.monotonic() > said + 0.5
-                ):
-                    self.put(commander.key, ZERO, commander.sender)
-                    said = time.monotonic()
-                return not neutral and counters.get("commands", 0) > before
+        def heard() -> bool:
+            nonlocal said
+            # A sender that is stamped on the way, for example by a router, must show its delays
+            # first. A message that arrives within a millisecond of another one is dropped.
+            state = self.state()
+            counters, waits = state["counters"], self._waits_for(state, source)
+            neutral = waits.startswith("send a zero first")
+            if neutral or counters.get("commands_of_new_senders") or time.monotonic() > said + 0.5:
+                self.put(commander.key, ZERO, commander.sender)
+                said = time.monotonic()
+            return not neutral and counters.get("commands", 0) > before
 
-            until(heard, 5.0, "the zero was received")
+        until(heard, 5.0, "the zero was received")
         with commander.sending():
             yield commander
 

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import os
-import select
 import signal
 import socket
-import subprocess
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -23,13 +21,11 @@ from acsard.host.errors import InUseError
 from acsard.machine.authority import Authority
 from tests.system.harness import (
     Bus,
-    acsard,
     children,
     free_endpoint,
     until,
-    write_config,
 )
-from tests.system.identities import Certificates, Gated, free_tls_endpoint
+from tests.system.identities import Certificates, Gated
 
 pytestmark = pytest.mark.network
 
@@ -127,17 +123,6 @@ def test_no_gateway_that_hangs_outlives_its_daemon(robot: Gated) -> None:
     )
 
 
-@pytest.mark.nightly
-def test_a_gateway_that_is_suspended_is_ended_and_restarted(robot: Gated) -> None:
-    first = gateway_of(robot)
-    os.kill(first, signal.SIGSTOP)
-    robot.daemon.gateway_opens(times=2)
-    assert robot.lets_in("viewer")
-    assert has_ended(first)
-    (line,) = robot.daemon.events("gateway_ended")
-    assert "stopped or hung" in line["text"]
-
-
 @pytest.mark.parametrize("paused", ["daemon", "gateway"])
 def test_a_stop_over_tls_that_waits_for_longer_than_two_seconds_stops_the_robot(
     robot: Gated, paused: str
@@ -172,22 +157,3 @@ def test_an_address_in_use_is_not_a_bad_certificate(certificates: Certificates) 
             InUseError, match=f"cannot listen on {tls}: Address already in use; .*stop that program"
         ):
             gateway_with(certificates.robot, tls).open()
-
-
-def test_a_gateway_ends_in_order_if_its_daemon_ended_without_reading_signs_of_life(
-    tmp_path: Path, certificates: Certificates
-) -> None:
-    """The gateway then reads a connection reset instead of an end of file. It still ends with 0."""
-    bus = {"listen": [free_endpoint(), free_tls_endpoint()], "tls": str(certificates.robot)}
-    config = write_config(tmp_path / "gateway.toml", {"bus": bus})
-    ours, theirs = socket.socketpair()
-    with ours, theirs:
-        gateway = subprocess.Popen(
-            acsard("gateway", "--supervised", "--config", str(config)),
-            stdin=theirs.fileno(), stderr=subprocess.PIPE, cwd=tmp_path, text=True,
-        )  # fmt: skip
-        theirs.close()
-        until(lambda: select.select([ours], [], [], 0)[0], 10.0, "a sign of life")
-        ours.close()
-        _, output = gateway.communicate(timeout=10.0)
-    assert (gateway.returncode, output) == (0, "")

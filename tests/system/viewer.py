@@ -35,18 +35,18 @@ class Came(NamedTuple):
 PROTOCOL = "foxglove.sdk.v1"
 
 
-def opened(port: int, protocol: str = PROTOCOL) -> ClientConnection:
+def opened(port: int) -> ClientConnection:
     """A bare connection whose data no task reads."""
     where = f"ws://127.0.0.1:{port}"
-    return connect(where, subprotocols=[Subprotocol(protocol)], close_timeout=0.5)
+    return connect(where, subprotocols=[Subprotocol(PROTOCOL)], close_timeout=0.5)
 
 
 class Viewer:
     """One connection to the bridge, which sorts all received messages by kind."""
 
-    def __init__(self, port: int, protocol: str = PROTOCOL, *, services: bool = True) -> None:
+    def __init__(self, port: int) -> None:
         self._opened = ExitStack()
-        self._socket = self._opened.enter_context(opened(port, protocol))
+        self._socket = self._opened.enter_context(opened(port))
         self.info: dict[str, Any] = {}
         self.channels: dict[str, dict[str, Any]] = {}
         self.services: dict[str, dict[str, Any]] = {}
@@ -57,11 +57,8 @@ class Viewer:
         self._numbers = iter(range(1, 1 << 30))
         self._thread = threading.Thread(target=self._listen, daemon=True)
         self._thread.start()
-        until(
-            lambda: self.info and self.channels and (self.services or not services),
-            5.0,
-            "what the server has",
-        )
+        has = lambda: self.info and self.channels and self.services  # noqa: E731
+        until(has, 5.0, "what the server has")
 
     def __enter__(self) -> Viewer:
         return self
