@@ -63,7 +63,7 @@ def test_the_motors_are_off_300_ms_after_the_last_valid_line(host: Host) -> None
     assert host.board.status().on_ns == status.on_ns, "not for a moment"
 
 
-def test_an_integral_wound_up_before_a_stop_does_not_drive_after_it(host: Host) -> None:
+def test_an_integral_wound_up_before_a_stop_does_not_drive_the_robot_after_it(host: Host) -> None:
     board = host.board
     for motor in "abcd":
         board.command(f"load {motor} 1")
@@ -72,6 +72,10 @@ def test_an_integral_wound_up_before_a_stop_does_not_drive_after_it(host: Host) 
     status = board.passes(400)
     host.drive(STOPPED, 0.3)
     assert board.status().on_ns == status.on_ns, "not for a moment"
+    for motor in "abcd":
+        board.command(f"load {motor} 0")
+    host.drive((2.0, 2.0, 2.0, 2.0), 0.1)
+    assert max(motor.speed for motor in board.status().motors) < 6.0
 
 
 def test_lines_that_come_without_a_pause_are_obeyed_and_do_not_restart_the_board(

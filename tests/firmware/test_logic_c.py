@@ -209,6 +209,7 @@ def test_the_duty_stays_within_its_limits_and_decays_to_zero_at_rest(
 
 
 @example([TOP] * 3 + [0, -TOP])
+@example([TOP] * 3 + [None, -TOP, -TOP])
 @given(st.lists(st.one_of(st.integers(-TOP, TOP), st.just(0), st.none()), max_size=200))
 def test_a_bridge_reverses_only_at_rest_and_its_duty_rises_slowly_and_falls_at_any_rate(
     library: Library, steps: list[int | None]
