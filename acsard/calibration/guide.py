@@ -7,7 +7,7 @@ samples of a sensor.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, suppress
 
 import msgspec
@@ -35,6 +35,7 @@ MAX_REPEATS = 20  # of a leg: then nobody is there who could type "q"
 TAPE_STD_M, LINE_STD_M = 0.005, 0.002
 SKID_HEADING, SKID_LENGTH = 0.015, 0.002
 MIN_TAPE_M = 0.5
+ODD_SHARE, ODD_DEG = 0.15, 30.0  # of the wheels' distance, to the line: readings to confirm
 TRACKS = 0.85, 3.0  # credible ratios of effective track and wheel separation
 
 Ride = Callable[[Leg], Run]
@@ -152,13 +153,15 @@ def guided(method: str, setup: Setup, prompt: Prompt, ride: Ride) -> Log:
         asks = leg.asks
         while True:
             found = {ask.name: prompt.number(ask) / 1000 for ask in asks}
+            asks = (WHEELBASE, *leg.asks) if method == "tape" else leg.asks
             wheelbase = found.get(WHEELBASE.name, wheelbase)
             try:
                 runs = _measured([*driven, (leg, run, found)], wheelbase, setup.drive)
-                break
+                doubts = "; ".join(_doubts(run, found, wheelbase, setup.drive))
+                if not doubts or prompt.ask(f"{doubts}. Is this right?", ("yes", "no")) != "no":
+                    break
             except LogError as error:
                 prompt.show_text(f"{error}: measure again")
-                asks = (WHEELBASE, *leg.asks)
         driven.append((leg, run, found))
         if leg.by_key:
             track = max(1.0, _track_ratio(run, runs[-1].tape[-1].value, setup.drive))
@@ -197,6 +200,20 @@ def _measured(driven: Sequence[Driven], wheelbase: Metres, drive: DriveConfig) -
             readings.append(TapeReading("turn", leg.whole_turns + slope - before, std))
         runs.append(replace(run, tape=tuple(readings)))
     return runs
+
+
+def _doubts(
+    run: Run, found: dict[str, Metres], wheelbase: Metres, drive: DriveConfig
+) -> Iterator[str]:
+    # Answers that are possible, but more likely misread.
+    mm, rolled = found.get("distance", 0.0) * 1000, run.left[-1] - run.left[0]
+    wheels = 500 * drive.wheel_radius * abs(float(rolled + run.right[-1] - run.right[0]))
+    if mm >= MIN_TAPE_M * 1000 and abs(mm - wheels) > ODD_SHARE * wheels:
+        yield f"you measured {mm:.0f} mm, but by its wheels the robot drove {wheels:.0f} mm"
+    if "front" in found:
+        angle = math.degrees(_line_angle(found["front"], found["rear"], wheelbase))
+        if abs(angle) > ODD_DEG:
+            yield f"by these distances the robot stands at {abs(angle):.0f} deg to the line"
 
 
 def _line_angle(front: Metres, rear: Metres, wheelbase: Metres) -> Rad:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import cmath
 import math
+import re
+from collections.abc import Sequence
 from contextlib import nullcontext
 from types import SimpleNamespace
 from unittest.mock import MagicMock
@@ -68,10 +70,14 @@ class Robot(Prompt):
             streams["yaw_rate"] = t, np.array(rates, dtype=np.float64)
         return run_of(leg.name, streams, Notes())
 
-    method = "tape"
+    method, confirms = "tape", "no"
 
     def show_text(self, text: str) -> None:
         self.said.append(text)
+
+    def ask(self, question: str, answers: Sequence[str]) -> str:
+        self.said.append(question)
+        return self.confirms
 
     def number(self, ask: NumberQuestion) -> float:
         if self.lies.get(ask.name):
@@ -204,8 +210,8 @@ def test_only_the_leg_of_a_turn_that_ended_too_early_is_repeated() -> None:
 @pytest.mark.parametrize(
     ("lies", "words"),
     [
-        ({"front": [100.0], "rear": [400.0]}, "250 mm apart"),
-        ({"wheelbase": [50.0]}, "50 mm apart"),  # which only a turned robot shows
+        ({"front": [100.0], "rear": [400.0]}, "two wheels that are 250 mm apart cannot be"),
+        ({"wheelbase": [50.0]}, "the robot stands at"),  # which only a turned robot shows
     ],
 )
 def test_distances_that_cannot_be_true_are_measured_again(
@@ -214,12 +220,32 @@ def test_distances_that_cannot_be_true_are_measured_again(
     robot, honest = Robot(1.5), Robot(1.5)
     robot.lies = lies
     log = guided("tape", SETUP, robot, robot.ride)
-    (text,) = (text for text in robot.said if "measure again" in text)
-    assert f"two wheels that are {words} cannot be" in text
+    (text,) = (text for text in robot.said if "measure again" in text or "right?" in text)
+    assert words in text
     right = guided("tape", SETUP, honest, honest.ride)
     assert [run.tape for run in log.runs[:2]] == [run.tape for run in right.runs[:2]]
     found = calibrate(log, Config(), "the drive").found
     assert found["wheel_separation_multiplier"] == pytest.approx(1.5, rel=0.025)
+
+
+@pytest.mark.parametrize("confirms", ["yes", "no"])
+@pytest.mark.parametrize(
+    ("lies", "words"),
+    [
+        ({"distance": [1500.0]}, r"you measured 1500 mm, but by its wheels .* 19\d\d mm"),
+        ({"front": [300.0], "rear": [450.0]}, "the robot stands at 37 deg to the line"),
+    ],
+)
+def test_a_reading_that_is_more_likely_misread_is_confirmed_or_measured_again(
+    lies: dict[str, list[float]], words: str, confirms: str
+) -> None:
+    robot, honest = Robot(1.5), Robot(1.5)
+    robot.lies, robot.confirms = {name: [*lie] for name, lie in lies.items()}, confirms
+    runs = guided("tape", SETUP, robot, robot.ride).runs
+    question = next(text for text in robot.said if "Is this right?" in text)
+    assert re.search(words, question)
+    right = guided("tape", SETUP, honest, honest.ride).runs
+    assert (runs[0].tape == right[0].tape) is (confirms == "no")
 
 
 @pytest.mark.parametrize(
