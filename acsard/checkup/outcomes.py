@@ -337,8 +337,9 @@ FAIL runaway: against | {letter}: commanded {told:.1f}, measured {seen:.1f} rad/
     -> swap this motor's two leads, or A and B of its encoder
 FAIL stop: turns | turns {seconds:g} s after zeros
     the encoders report that {motors} did not stop although this computer sends zeros
-    -> does a hand or a slope turn it? If not, cut the motors' power: the firmware must stop a motor
-    at `p00.00`
+    -> does a hand or a slope turn it? If it turns by itself, cut the motors' power: the firmware
+    must stop a motor at `p00.00`. If it stands, the firmware must report `p00.00`, not its last
+    speed
 FAIL restarts: seen | {times}
     the board restarted {told}
     -> is the supply weak (brown-out when motors start, a USB hub)? Use a separate supply for the
