@@ -74,6 +74,9 @@ def drive(
         ) from None
     if file:
         require_own(config, file_config, file)
+    state = client.get("state")
+    if state.mode in NEVER_DRIVING_MODES:
+        raise NotDrivenError(state.why)
     method = options.method or (
         "poses" if options.poses else "gyro" if config.odometry.gyro else "tape"
     )

@@ -272,6 +272,16 @@ def test_a_drive_of_the_simulator_for_a_robot_s_file_is_refused_before_it_begins
         drive(client, Options(), Prompt(), "robot.toml", parse(REAL.encode()))
 
 
+def test_a_robot_that_is_stopped_already_is_named_before_the_first_question() -> None:
+    client = MagicMock()
+    client.get.side_effect = [
+        SimpleNamespace(simulated=True), effective(Config()),
+        SimpleNamespace(mode="stopped", why="stopped by phone; type `acsard call clear`"),
+    ]  # fmt: skip
+    with pytest.raises(NotDrivenError, match="stopped by phone"):
+        drive(client, Options("tape"), Prompt(), "", Config())
+
+
 @pytest.mark.parametrize(
     ("text", "words"),
     [
