@@ -151,7 +151,7 @@ def guided(method: str, setup: Setup, prompt: Prompt, ride: Ride) -> Log:
     while len(runs) < len(plan := legs(method, setup, track)):
         leg = plan[len(runs)]
         end = "" if leg.by_key else " It stops by itself: press a key only if you must stop it."
-        words = f"{len(runs) + 1}. {leg.words}{end} ({leg.seconds:.0f} s)"
+        words = f"{len(runs) + 1} of {len(plan)}: {leg.words}{end} ({leg.seconds:.0f} s)"
         run = _repeated(leg, words, prompt, ride, setup.drive)
         asks = leg.asks
         while True:

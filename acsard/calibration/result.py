@@ -115,7 +115,7 @@ def _geometry(
         for e, words, factor, unit in (
             (found.turn, "a turn of 360 deg errs by", 180 / math.pi, "deg"),
             (found.place, "positions err by", 100.0, "cm"),
-            (found.readings, "your readings are missed by", 1.0, "of their deviations"),
+            (found.readings, "your measurements are off by", 1.0, "of their usual error"),
         ) if e is not None
     ]  # fmt: skip
     if not found.better:

@@ -99,6 +99,7 @@ def test_a_guided_drive_finds_track_and_size_and_stays_on_the_floor(
     robot = Robot(track)
     robot.method = method
     log = guided(method, SETUP, robot, robot.ride)
+    assert f"{len(log.runs)} of {len(log.runs)}: The robot" in robot.said[-1]
     result = calibrate(log, Config(), "the drive")
     print(result.found, result.deviations)
     found = result.found["wheel_separation_multiplier"]
