@@ -88,7 +88,8 @@ FACTS: list[tuple[str, Any]] = [
     # Senders.
     ("words.person('here/0123456789abcdef', 'here/0123456789abcdef')", "you"),
     (f"words.person('here/0123456789abcdef', {OTHER})", "another page on the robot itself"),
-    (f"words.person('phone/0123456789abcdef [robot]', {OTHER})", "phone"),
+    (f"words.person('phone/0123456789abcdef [robot]', {OTHER})", "phone [robot]"),
+    (f"words.person('phone@page/0123456789abcdef [robot]', {OTHER})", "the page of phone [robot]"),
     ("words.person('phone/0123456789abcdef', 'phone/fedcba9876543210')", "another page of phone"),
     ("words.person('0123456789abcdef')", "a program without a name"),
     ("words.person('session 0123456789abcdef')", "a program without a name"),

@@ -62,16 +62,23 @@ export function yaw(q) {
 }
 
 /** Return a short name for people for a sender's public name, "NAME/DIGITS [CERTIFICATE]" or "session DIGITS
- *  [CERTIFICATE]". `own` is the public name of this page, "" if it is not known. */
+ *  [CERTIFICATE]". A certificate is always shown: the sender chose its name itself. `own` is the public name of this
+ *  page, "" if it is not known. */
 export function person(sender, own = "") {
-  const [, name, certificate] = sender.match(/^(?:(.*)\/|session )?[0-9a-f]{16}(?: \[(.*)\])?$/) ?? [null, sender];
   if (own && sender === own) return "you";
+  const [, bare, certificate] = sender.match(/^(.*) \[(.*)\]$/) ?? [null, sender];
+  if (!certificate) return claimed(bare, own);
+  return bare.startsWith("session ") ? certificate : `${claimed(bare, own)} [${certificate}]`;
+}
+
+function claimed(sender, own) {
+  const [, name] = sender.match(/^(?:(.*)\/|session )?[0-9a-f]{16}$/) ?? [null, sender];
   if (name === "unnamed") return NAMELESS;
   if (name === "here") return "another page on the robot itself";
   const ours = own.replace(/\/[^/]*$/, "");
   if (name && name === ours) return `another page of ${name}`;
   if (name?.endsWith("@page")) return name === `${ours}@page` ? "your page" : `the page of ${name.slice(0, -5)}`;
-  return name || certificate || NAMELESS;
+  return name || NAMELESS;
 }
 
 /** Return why the robot moves or does not move, in the words of this page. `own` is the public name of this page. */
