@@ -283,7 +283,8 @@ reply_period
 received_nothing
     no link to the microcontroller: {received};
     -> does the board have power, is mcu.port its port, is mcu.baud_rate right, are TX and RX
-    swapped{firmware}? `acsard mcu check` finds out more
+    swapped, does another program read the port (`acsard doctor`){firmware}? `acsard mcu check`
+    finds out more
 received_statuses
     no link to the microcontroller: {received};
     -> is TX of this computer connected to RX of the board? `acsard mcu check` finds out more

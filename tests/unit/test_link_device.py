@@ -7,6 +7,7 @@ import fcntl
 import itertools
 import os
 import pty
+import subprocess
 import termios
 import threading
 from collections.abc import Iterator
@@ -16,6 +17,7 @@ from typing import get_args
 import pytest
 
 from acsard.core.config.settings import Baud
+from acsard.daemon.serial.blocking import BlockingPort
 from acsard.daemon.serial.device import (
     baud_rate_of,
     close,
@@ -158,6 +160,19 @@ def test_a_port_is_closed_without_waiting_for_the_thread_that_closes_it(
     monkeypatch.setattr(threading.Thread, "start", None)  # it waits
     close(device, wait_s=5.0)
     device.close()
+
+
+def test_a_program_that_reads_the_port_without_a_lock_is_named_before_the_check(path: str) -> None:
+    port = BlockingPort(path)
+    with open(path) as there, subprocess.Popen(["cat"], stdin=there, stdout=subprocess.PIPE) as cat:
+        there.close()
+        try:
+            with pytest.raises(InUseError, match=rf"in use by process {cat.pid} \(cat\); stop"):
+                port.open(115200)
+        finally:
+            cat.kill()
+    port.open(115200)
+    port.close()
 
 
 def test_a_port_is_locked_while_it_is_open_and_free_when_it_is_closed(path: str) -> None:

@@ -12,9 +12,9 @@ import serial
 from acsard.checkup.board import Wire
 from acsard.checkup.findings import WireLostError
 from acsard.core.values import NS_PER_S, Ns
-from acsard.daemon.serial.device import close, draining, open_raw, refusal, set_baud_rate
+from acsard.daemon.serial.device import close, draining, in_use, open_raw, refusal, set_baud_rate
 from acsard.host import clock
-from acsard.host.processes import Holder, master_of, waited_ns
+from acsard.host.processes import Holder, holders, master_of, masters_of, waited_ns
 
 SEND_TIMEOUT_S = 0.5  # for all bytes; a line needs 50 ms at the lowest baud rate
 
@@ -38,6 +38,9 @@ class BlockingPort(Wire):
                 raise refusal(self._path, error) from error
             self._program = master_of(self._path)
             self.late_ns()
+            if (reader := self._reader()) is not None:
+                self.close()
+                raise in_use(self._path, reader)
             return
         fd = self._device.fileno()
         try:
@@ -45,6 +48,13 @@ class BlockingPort(Wire):
             termios.tcflush(fd, termios.TCIFLUSH)
         except (OSError, termios.error) as error:
             raise WireLostError(f"{self._path}: {error}") from error
+
+    def _reader(self) -> Holder | None:
+        # Another program that has the port open without a lock, and takes the replies. A daemon
+        # that still closes the port reads no more.
+        own = {os.getpid(), *(master.pid for master in masters_of(self._path))}
+        others = (each for each in holders(self._path) if each.pid not in own)
+        return next((each for each in others if each.name != "acsard"), None)
 
     def close(self) -> None:
         device, self._device = self._device, None

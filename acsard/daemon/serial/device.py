@@ -19,7 +19,7 @@ from acsard.core.values import Ns
 from acsard.host import clock
 from acsard.host.errors import InUseError, MendableError, NoPortError, NotPermittedError
 from acsard.host.port_access import GETTY, console_advice, denial
-from acsard.host.processes import holder_of
+from acsard.host.processes import Holder, holder_of
 from acsard.host.threads import NoThreadError, begin
 
 _left_open: list[int] = []  # descriptors that `close` had no thread for
@@ -180,17 +180,21 @@ def refusal(path: str, error: OSError) -> MendableError:
                 "permission, acsard.service may not allow this type of device"
             )
         case errno.EBUSY | errno.EAGAIN:
-            holder = holder_of(path)
-            if holder and holder.name == GETTY:
-                advice = console_advice(path)
-                return InUseError(f"{path} is in use by a login console ({GETTY}); {advice}")
-            owner = f"process {holder.pid}" if holder else "another process"
-            return InUseError(
-                f"{path} is in use by {owner}; stop that process first (`systemctl stop acsard` if "
-                "it is the service of acsard)"
-            )
+            return in_use(path, holder_of(path))
         case _:
             return MendableError(f"cannot open {path}: {error}")
+
+
+def in_use(path: str, holder: Holder | None) -> InUseError:
+    """Return the error that names the process that has the port open."""
+    if holder and holder.name == GETTY:
+        advice = console_advice(path)
+        return InUseError(f"{path} is in use by a login console ({GETTY}); {advice}")
+    owner = f"process {holder.pid} ({holder.name})" if holder else "another process"
+    return InUseError(
+        f"{path} is in use by {owner}; stop that process first (`systemctl stop acsard` if it is "
+        "the service of acsard)"
+    )
 
 
 _LISTED = "`acsard ports` lists the serial ports"
