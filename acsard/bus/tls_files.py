@@ -35,8 +35,12 @@ def require_usable(directory: str) -> None:
             f"there is no directory {directory}: name the directory with {CA}, {CERTIFICATE} and "
             f"{KEY} that `acsard tls init` or `acsard tls add` made"
         )
-    for name in (CA, CERTIFICATE, KEY):
-        file = Path(directory) / name
+    require_usable_files(*files_in(directory))
+
+
+def require_usable_files(authority: Path, certificate: Path, key: Path) -> None:
+    """Check three files as `require_usable` does."""
+    for file in (authority, certificate, key):
         try:
             file.read_bytes()
         except PermissionError:
@@ -49,11 +53,11 @@ def require_usable(directory: str) -> None:
                 f"cannot read {file}: {error.strerror}; make it with `acsard tls init` or "
                 "`acsard tls add`"
             ) from None
-    why = unusable(*files_in(directory))
+    why = unusable(authority, certificate, key)
     if why:
         raise CertificateError(
-            f"the certificates in {directory} cannot be used ({why}): either they are not PEM, "
-            "or the key belongs to another certificate, or the key has a password; make new "
+            f"the certificates in {certificate.parent} cannot be used ({why}): either they are not "
+            "PEM, or the key belongs to another certificate, or the key has a password; make new "
             "certificates with `acsard tls init` or `acsard tls add`",
         )
 

@@ -57,7 +57,7 @@ def daemon_session(config: Config) -> zenoh.Session:
     settings |= _listening()
     if bus.tls_routers:
         # With files that Zenoh refuses, the session would open, and never reach the router.
-        _require_accepted(bus.tls)
+        require_accepted(*files_in(bus.tls))
         settings |= _tls(bus.tls)
     if bus.connect:
         settings |= RETRY_SETTINGS
@@ -98,15 +98,16 @@ def gateway_session(config: Config) -> zenoh.Session:
         return _opened(settings, bus.outside)
     except InUseError:
         # Zenoh's error is of the same type for an address in use and for files that it refuses.
-        _require_accepted(bus.tls)
+        require_accepted(*files_in(bus.tls))
         raise
 
 
-def _require_accepted(directory: str) -> None:
-    why = certificate_trouble(*files_in(directory))
+def require_accepted(authority: Path, certificate: Path, key: Path) -> None:
+    """Raise `CertificateError` if Zenoh cannot listen with these files."""
+    why = certificate_trouble(authority, certificate, key)
     if why:
         raise CertificateError(
-            f"{directory}/{CERTIFICATE} with the key {directory}/{KEY} cannot be used: OpenSSL "
+            f"{certificate} with the key {key} cannot be used: OpenSSL "
             f"accepts these files, but Zenoh does not ({why}); to make files that Zenoh accepts, "
             f"{RENEW_ADVICE}"
         ) from None
@@ -240,7 +241,7 @@ def client_session(endpoint: str, tls: str = "") -> zenoh.Session:
     except zenoh.ZError:
         reason = ""
         if secured:
-            _require_accepted(tls)
+            require_accepted(*files_in(tls))
             reason = trouble(endpoint, tls)
         # The message leaves out Zenoh's own error, which names Zenoh's source files.
         raise UnreachableError(

@@ -13,7 +13,8 @@ from typing import Any
 
 import zenoh
 
-from acsard.bus.zenoh_sessions import first_line, log_from_environment
+from acsard.bus.tls_files import require_usable_files
+from acsard.bus.zenoh_sessions import first_line, log_from_environment, require_accepted
 from acsard.core.config.settings import LogConfig
 from acsard.host.child import end_signals
 from acsard.host.errors import Exit, ExitError, MendableError
@@ -23,6 +24,8 @@ from acsard.host.logs import Log
 _VALUE_ERROR = re.compile(
     r'msg: "((?:[^"\\]|\\.)*)", location: Some\(Location \{ line: (\d+), column: (\d+) \}\)'
 )
+
+CERTIFICATE_FILES = ("root_ca_certificate", "listen_certificate", "listen_private_key")
 
 _SYNTAX_ERROR = re.compile(
     r"--> (\d+):(\d+)\n.*^ *= ([^\n]*?)(?: at /\S+\.rs:\d+\.?)?$", re.M | re.S
@@ -53,8 +56,9 @@ def main(args: argparse.Namespace) -> int:
 def open_router(file: Path) -> tuple[zenoh.Session, str]:
     """Open the router, and return its session and the addresses at which it listens.
 
-    Raises `ExitError` if the file cannot be read or is not a router's configuration, and
-    `MendableError` if Zenoh cannot open the router, for example because an address is in use.
+    Raises `ExitError` if the file cannot be read or is not a router's configuration,
+    `CertificateError` or `NotPermittedError` for its certificate files, and `MendableError` if
+    Zenoh cannot open the router, for example because an address is in use.
     """
     try:
         # Read the file here, because Zenoh's error would not say why the file cannot be opened.
@@ -79,14 +83,20 @@ def open_router(file: Path) -> tuple[zenoh.Session, str]:
             f'{file} is not the configuration of a router: it needs mode: "router" and '
             'listen: { endpoints: ["tls/..."] }',
         )
-    where = ", ".join(endpoints)
+    tls, where = _setting(config, "transport/link/tls"), ", ".join(endpoints)
+    names = [tls[name] for name in CERTIFICATE_FILES]
+    files = [Path(name) for name in names if name]
+    has_files = len(files) == len(CERTIFICATE_FILES)
+    if has_files:
+        require_usable_files(*files)
     try:
         return zenoh.open(config), where
     except zenoh.ZError as error:
+        if has_files:
+            require_accepted(*files)
         raise MendableError(
             f"cannot open the router of {file} at {where}: {_reason(error)}; end the program that "
-            "uses the address, or correct the file, and make sure that this user can read the "
-            "certificates that it names"
+            "uses the address, or correct the file"
         ) from error
 
 

@@ -21,9 +21,10 @@ from acsard.core.config.settings import (
 )
 from acsard.core.messages.keys_and_roles import JSON_TREE, TOPICS, source_keys
 from acsard.core.values import ROLES, Role
-from acsard.host.errors import ExitError, UsageError
+from acsard.host.errors import CertificateError, ExitError, UsageError
 from acsard.machine.router_file import router_file
 from tests.each import each
+from tests.unit.test_access_tls import BROKEN, make_certificates
 
 TEMPLATE = (Path(__file__).resolve().parents[2] / "deploy" / "zenoh" / "router.json5").read_text()
 TEN = tuple(f"robot{n}" for n in range(1, 11))
@@ -184,3 +185,15 @@ def test_a_file_that_is_not_for_a_router_is_refused_with_its_name_the_place_and_
     assert phrase in str(error.value)
     assert "router.json5" in str(error.value)
     assert not [word for word in (".rs", "Location") if word in str(error.value)]
+
+
+@each("how", ["no key", "another's key"])
+def test_wrong_certificate_files_are_a_bad_configuration_with_their_path(
+    tmp_path: Path, how: str
+) -> None:
+    BROKEN[how](make_certificates(tmp_path))
+    file = tmp_path / "router.json5"
+    text = TEMPLATE.replace("/etc/zenohd/tls", str(tmp_path)).replace("0.0.0.0:7447", "127.0.0.1:0")
+    file.write_text(text)
+    with pytest.raises(CertificateError, match=str(tmp_path)):
+        open_router(file)
