@@ -233,7 +233,7 @@ guard_too_long
     although the longest ramp to zero has ended
 
 port_closed
-    the serial port is closed; it is being reopened
+    the serial port is closed
 port_trouble
     {trouble}
 port_released

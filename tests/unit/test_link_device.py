@@ -22,14 +22,16 @@ from acsard.daemon.serial.device import (
     baud_rate_of,
     close,
     draining,
+    in_use,
     open_raw,
     refusal,
     set_baud_rate,
     unsent,
 )
-from acsard.host import clock
+from acsard.host import clock, processes
 from acsard.host.errors import Exit, InUseError
 from acsard.host.port_access import denial
+from acsard.host.processes import Holder
 from tests.each import each
 
 
@@ -173,6 +175,25 @@ def test_a_program_that_reads_the_port_without_a_lock_is_named_before_the_check(
             cat.kill()
     port.open(115200)
     port.close()
+
+
+@pytest.mark.parametrize(
+    ("command", "words"),
+    [
+        (
+            "python3\0/usr/bin/acsard\0mcu\0check",
+            "`acsard mcu check` (process 7): wait for its end",
+        ),
+        ("python3\0/usr/bin/acsard\0run", "process 7 (acsard); stop that process first"),
+    ],
+)
+def test_a_check_that_has_the_port_is_waited_for_and_not_stopped(
+    command: str, words: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(processes, "PROC", tmp_path)
+    (tmp_path / "7").mkdir()
+    (tmp_path / "7/cmdline").write_text(command)
+    assert words in str(in_use("/dev/acsar_mcu", Holder(7, "acsard")))
 
 
 def test_a_port_is_locked_while_it_is_open_and_free_when_it_is_closed(path: str) -> None:
