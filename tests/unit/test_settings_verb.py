@@ -28,6 +28,10 @@ def test_a_value_is_as_in_the_file_and_a_bare_word_is_a_text(word: str, value: o
     assert type(settings["log.level"]) is type(value)
 
 
+NOBODY = 1 << 30
+"""No process has this id."""
+
+
 class Robot:
     """A robot that sets everything."""
 
@@ -41,7 +45,7 @@ class Robot:
 
     def get(self, key: str) -> Info:
         assert key == "info"
-        return Info("acsar", "0", 1, "sim", True, 100.0, [], [])
+        return Info("acsar", "0", NOBODY, "sim", True, 100.0, [], [])
 
     def set(self, settings: dict[str, object]) -> ServiceReply:
         self.settings = settings
