@@ -28,8 +28,8 @@ def test_a_value_is_as_in_the_file_and_a_bare_word_is_a_text(word: str, value: o
     assert type(settings["log.level"]) is type(value)
 
 
-NOBODY = 1 << 30
-"""No process has this id."""
+PID = 1 << 30
+"""No process of this computer has this id."""
 
 
 class Robot:
@@ -45,7 +45,7 @@ class Robot:
 
     def get(self, key: str) -> Info:
         assert key == "info"
-        return Info("acsar", "0", NOBODY, "sim", True, 100.0, [], [])
+        return Info("acsar", "0", PID, "sim", True, 100.0, [], [])
 
     def set(self, settings: dict[str, object]) -> ServiceReply:
         self.settings = settings
@@ -84,7 +84,7 @@ def test_keep_says_that_the_daemon_uses_another_file(
     tmp_path: Path,
 ) -> None:
     where = Path(mkdtemp(dir=tmp_path))
-    used, other, process = (where / name for name in ("acsard.toml", "robot2.toml", "1"))
+    used, other, process = (where / name for name in ("acsard.toml", "robot2.toml", str(PID)))
     used.touch()
     other.touch()
     process.mkdir()
