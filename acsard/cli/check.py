@@ -1,5 +1,5 @@
 """Print the effective configuration, including all defaults. If the configuration has problems,
-print all of them, each with its fix, and exit with code 78.
+print all of them, each with its fix, and exit with code 78. The files of bus.tls are checked, too.
 """
 
 from __future__ import annotations
@@ -11,12 +11,13 @@ from pathlib import Path
 
 import msgspec
 
+from acsard.bus.tls_files import require_usable
 from acsard.cli.common import add_config, load
 from acsard.core.config.contradictions import warnings
 from acsard.core.config.parsing import effective
 from acsard.core.config.toml_text import document
 from acsard.core.formatting import json_line, many
-from acsard.host.errors import MendableError
+from acsard.host.errors import MendableError, NotPermittedError
 from acsard.machine.deploy_files import reference, source
 
 STDOUT = 1
@@ -36,13 +37,18 @@ def main(args: argparse.Namespace) -> int:
         return _write_new(args.new)
     where, config = load(args.config)
     _require_other_output(where)
+    found, bus = warnings(config), config.bus
+    if bus.tls_routers or bus.outside:
+        try:
+            require_usable(bus.tls)
+        except NotPermittedError as error:
+            found.append(f"the certificates were not checked: {error}")
     plain = effective(config)
     if args.json:
         print(json_line(msgspec.json.encode(plain).decode()))
     else:
         print(f"# effective configuration from {where}")
         print("\n".join(document(plain)))
-    found = warnings(config)
     for text in found:
         print(f"{where}: warning: {text}", file=sys.stderr)
     print(f"{where}: no mistakes, {many(len(found), 'warning')}", file=sys.stderr)

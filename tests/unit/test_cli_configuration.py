@@ -19,7 +19,7 @@ from acsard.core.config.parsing import parse
 from acsard.core.config.settings import Config, McuConfig, WebConfig
 from acsard.host import config_file
 from acsard.host.config_file import SEARCH_PATHS, find
-from acsard.host.errors import Exit, MendableError, UsageError
+from acsard.host.errors import CertificateError, Exit, MendableError, UsageError
 from acsard.host.version import version
 from acsard.machine.examination import OPTION_KEYS
 
@@ -160,6 +160,15 @@ def test_a_good_file_is_printed_with_its_place_and_its_warnings(
     assert parse(out.encode()) == parse(file.read_bytes())
     assert err.startswith(f"{file}: warning: control.rate = 29 ")
     assert err.endswith(f"\n{file}: no mistakes, 1 warning\n")
+
+
+def test_certificates_that_the_daemon_would_refuse_are_a_mistake(tmp_path: Path) -> None:
+    file = tmp_path / "robot.toml"
+    file.write_text(
+        f'[bus]\nlisten = ["tls/127.0.0.1:7449", "tcp/127.0.0.1:7448"]\ntls = "{tmp_path}"\n'
+    )
+    with pytest.raises(CertificateError, match="cannot read"):
+        main(argparse.Namespace(config=str(file), json=False, new=None))
 
 
 @pytest.mark.parametrize("sign", [">", ">>"])
