@@ -7,7 +7,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from acsard.core.config.settings import is_tls
+from acsard.core.config.settings import Config, is_tls
 from acsard.core.values import NS_PER_S, WallNs
 from acsard.host.errors import CertificateError, NotPermittedError
 
@@ -89,6 +89,19 @@ def common_name(directory: str) -> str:
     subject: Any = _decoded(directory).get("subject", ())
     names = [value for part in subject for kind, value in part if kind == "commonName"]
     return str(names[-1]) if names else ""
+
+
+def name_warnings(config: Config) -> list[str]:
+    """Return a warning if the access rules of a TLS router would hide the daemon from everyone."""
+    bus, robot_id = config.bus, config.robot.id
+    name = common_name(bus.tls) if bus.tls_routers else ""
+    if name in ("", robot_id):
+        return []
+    return [
+        f'robot.id = "{robot_id}", but the name of the certificate in {bus.tls} is "{name}": a '
+        "router of `acsard tls router` lets a robot use only the id that is the name of its "
+        "certificate, and would hide this one from everyone; write the same name into both"
+    ]
 
 
 def shown_at(endpoint: str, directory: str) -> str:

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import msgspec
 
-from acsard.bus.tls_files import require_usable
+from acsard.bus.tls_files import name_warnings, require_usable
 from acsard.cli.common import add_config, load
 from acsard.core.config.contradictions import warnings
 from acsard.core.config.parsing import effective
@@ -37,7 +37,7 @@ def main(args: argparse.Namespace) -> int:
         return _write_new(args.new)
     where, config = load(args.config)
     _require_other_output(where)
-    found, bus = warnings(config), config.bus
+    found, bus = warnings(config) + name_warnings(config), config.bus
     if bus.tls_routers or bus.outside:
         try:
             require_usable(bus.tls)

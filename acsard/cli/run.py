@@ -16,6 +16,7 @@ from pathlib import Path
 
 from acsard.bus.address import address_of
 from acsard.bus.robot_discovery import ALL_ROBOTS, running_robots
+from acsard.bus.tls_files import name_warnings
 from acsard.bus.zenoh_sessions import reachable
 from acsard.cli.common import add_config, add_port, load, with_record_directory
 from acsard.client.connection import open_connection
@@ -89,6 +90,7 @@ def options(args: argparse.Namespace) -> dict[str, object]:
 def main(args: argparse.Namespace) -> int:
     where, config = load(args.config, options(args))
     config = with_record_directory(config)
+    unexpected = warnings(config) + name_warnings(config)
     log, screen, served = Log(config.log), Writer(sys.stdout), page(config, where)
 
     def announce(device: str, trouble: str) -> None:
@@ -110,7 +112,7 @@ def main(args: argparse.Namespace) -> int:
             bus=_bus(config),
             config=where,
         )
-        for text in warnings(config):
+        for text in unexpected:
             log.event(Event("configuration", text, "warning"))
 
     gateway = ["gateway", "--id", config.robot.id, "--namespace", config.ros.namespace]

@@ -13,8 +13,15 @@ import pytest
 from cryptography.hazmat.primitives import serialization
 
 from acsard.bus import tls_trouble
-from acsard.bus.tls_files import AUTHORITY, common_name, expiry_times, require_usable
+from acsard.bus.tls_files import (
+    AUTHORITY,
+    common_name,
+    expiry_times,
+    name_warnings,
+    require_usable,
+)
 from acsard.bus.tls_trouble import trouble
+from acsard.core.config.settings import BusConfig, Config, RobotConfig
 from acsard.core.values import NS_PER_S
 from acsard.host.errors import CertificateError
 from acsard.machine.authority import Authority
@@ -36,6 +43,21 @@ def test_the_common_name_is_read_and_is_empty_for_an_unusable_certificate(
     assert common_name(str(tmp_path / "anna")) == "laptop-anna"
     (tmp_path / "certificate.pem").write_text("junk")
     assert common_name(str(tmp_path)) == common_name(str(tmp_path / "nobody")) == ""
+
+
+@pytest.mark.parametrize(
+    ("router", "robot_id", "is_hidden"),
+    [("tls/a:1", "robot2", True), ("tls/a:1", "robot", False), ("tcp/a:1", "robot2", False)],
+)
+def test_a_robot_that_its_router_would_hide_is_warned_of(
+    tmp_path: Path, router: str, robot_id: str, is_hidden: bool
+) -> None:
+    make_certificates(tmp_path)
+    bus = BusConfig(connect=(router,), tls=str(tmp_path))
+    texts = name_warnings(Config(robot=RobotConfig(id=robot_id), bus=bus))
+    assert ['robot.id = "robot2"' in text and '"robot"' in text for text in texts] == [True] * (
+        is_hidden
+    )
 
 
 def mixed(where: Path) -> None:
