@@ -1,4 +1,4 @@
-"""Finds the files of `deploy/` that a package of acsard contains: units, udev rules, examples."""
+"""Finds the files of `deploy/` that a package of acsard contains."""
 
 from __future__ import annotations
 
@@ -7,8 +7,8 @@ from pathlib import Path
 import acsard
 from acsard.host.errors import MendableError
 
-# `pyproject.toml` has the same list for the wheel, and the reference `acsard.toml` beside them.
-PACKAGED = ("systemd", "udev", "zenoh/router.json5")
+# `pyproject.toml` has the same list for the wheel, and `acsard.toml` beside them.
+PACKAGED = ("systemd", "udev", "zenoh", "ros2")
 
 
 def source() -> Path:

@@ -245,10 +245,7 @@ def _fill(place: Path, python: str) -> None:
     skipped = shutil.ignore_patterns("__pycache__")
     shutil.copytree(Path(acsard.__file__).parent, ours, ignore=skipped, dirs_exist_ok=True)
     for name in PACKAGED:
-        if (deploy / name).is_dir():
-            shutil.copytree(deploy / name, ours / "deploy" / name, dirs_exist_ok=True)
-        else:
-            _copy_file(deploy / name, ours / "deploy" / name)
+        shutil.copytree(deploy / name, ours / "deploy" / name, ignore=skipped, dirs_exist_ok=True)
     _copy_file(reference(deploy), ours / "deploy" / "acsard.toml")
     if commit := own.source():
         (ours / own.COMMIT_FILE).write_text(f"{commit}\n")
