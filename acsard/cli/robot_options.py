@@ -55,6 +55,7 @@ def robot_address(args: argparse.Namespace) -> Address:
     """Return the address of the robot that the options name. Raises `UsageError` for several."""
     require_one(args)
     _, config = load(args.config)
+    _require_named(args, config)
     return address_of(config, args.connect, args.id, args.tls)
 
 
@@ -72,6 +73,22 @@ def require_one(args: argparse.Namespace) -> None:
         )
 
 
+def _require_named(args: argparse.Namespace, config: Config) -> None:
+    # A file with `[fleet] robots` and without robot.id is not a robot's: "acsar" is no robot there.
+    robots, default = config.fleet.robots, Config().robot.id
+    if args.id is not None or config.robot.id != default or not robots or default in robots:
+        return
+    if getattr(args, "service", "") == "stop":
+        raise UsageError(
+            "no robot is named, nothing was stopped: `acsard call stop --id '*'` stops all, "
+            f"`--id {robots[0]}` one"
+        )
+    raise UsageError(
+        f"no robot is named: add one of [fleet] robots, such as `--id {robots[0]}`; `acsard fleet` "
+        "lists them"
+    )
+
+
 @contextmanager
 def connected_to_many(args: argparse.Namespace) -> Iterator[tuple[Connection, tuple[str, ...]]]:
     """Yield a client, and the ids of the robots to use by `Connection.sibling`.
@@ -81,6 +98,7 @@ def connected_to_many(args: argparse.Namespace) -> Iterator[tuple[Connection, tu
     """
     many = several_ids(args)
     _, config = load(args.config)
+    _require_named(args, config)
     if ALL_ROBOTS in many:
         many += config.fleet.robots
     where = address_of(config, args.connect, None if many else args.id, args.tls)

@@ -38,6 +38,30 @@ def test_a_refused_permission_is_no_silence(
 
 
 @pytest.mark.parametrize(
+    ("words", "text"),
+    [
+        (
+            ("call", "stop"),
+            "nothing was stopped: `acsard call stop --id '*'` stops all, `--id robot1` one",
+        ),
+        (("get", "state"), "no robot is named: add one of [fleet] robots, such as `--id robot1`"),
+        (
+            ("move", "forward", "1"),
+            "no robot is named: add one of [fleet] robots, such as `--id robot1`",
+        ),
+    ],
+)
+def test_a_computer_of_a_fleet_asks_for_the_robot(
+    words: tuple[str, ...], text: str, tmp_path: Path
+) -> None:
+    config = tmp_path / "acsard.toml"
+    config.write_text('[fleet]\nrobots = ["robot1", "robot2"]\n')
+    ended = typed(*words, "--config", str(config), "--connect", free_endpoint())
+    assert ended.code == Exit.USAGE
+    assert text in ended.err
+
+
+@pytest.mark.parametrize(
     ("words", "begin"),
     [
         (
