@@ -204,6 +204,11 @@ def _configuration(robot: Connection, info: Info, file: Config) -> Config:
 
 def compared(running: Running, file: Config) -> Iterator[Finding]:
     """Yield a finding about the values of the daemon that differ from those of the file."""
+    runs, ours = running.config.robot.id, file.robot.id
+    if runs != ours:
+        text = f"the file is not compared with the daemon: it is for robot {ours}, not for {runs}"
+        yield Finding("configuration", "ok", text)
+        return
     others = differences(running.config, file)
     if not others:
         yield Finding("configuration", "ok", "the running daemon uses the file's values")

@@ -67,6 +67,13 @@ def test_values_of_command_line_options_are_no_warning() -> None:
     assert "mcu.port = " in finding.text
 
 
+def test_the_file_of_another_robot_is_not_compared() -> None:
+    runs = replace(FILE, robot=replace(FILE.robot, id="robot1"))
+    (finding,) = compared(running(runs), FILE)
+    assert (finding.level, finding.mend) == ("ok", "")
+    assert "it is for robot " in finding.text
+
+
 def test_values_that_were_set_and_sources_that_only_the_file_has_are_a_warning() -> None:
     limits = replace(FILE.limits, linear_speed=0.4)
     commands = replace(FILE.commands, sources=FILE.commands.sources[1:])
