@@ -86,8 +86,17 @@ def is_daemon_here(pid: int) -> bool:
 
     A daemon in another container may have the process id of another subcommand here.
     """
+    return _runs(pid, "run")
+
+
+def is_check_here(pid: int) -> bool:
+    """Return whether `acsard mcu check` with the process id `pid` runs on this machine."""
+    return _runs(pid, "check")
+
+
+def _runs(pid: int, subcommand: str) -> bool:
     command = _text(PROC / str(pid) / "cmdline").split("\0")
-    return _is_acsard(command) and "run" in command
+    return _is_acsard(command) and subcommand in command
 
 
 def config_of(pid: int) -> Path | None:

@@ -185,6 +185,10 @@ def test_a_program_that_reads_the_port_without_a_lock_is_named_before_the_check(
             "`acsard mcu check` (process 7): wait for its end",
         ),
         ("python3\0/usr/bin/acsard\0run", "process 7 (acsard); stop that process first"),
+        (
+            "python3\0/usr/bin/acsard\0sim\0--link\0mcu",
+            "process 7 (acsard); stop that process first",
+        ),
     ],
 )
 def test_a_check_that_has_the_port_is_waited_for_and_not_stopped(

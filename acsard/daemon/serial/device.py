@@ -19,7 +19,7 @@ from acsard.core.values import Ns
 from acsard.host import clock
 from acsard.host.errors import InUseError, MendableError, NoPortError, NotPermittedError
 from acsard.host.port_access import GETTY, console_advice, denial
-from acsard.host.processes import Holder, holder_of, is_daemon_here
+from acsard.host.processes import Holder, holder_of, is_check_here
 from acsard.host.threads import NoThreadError, begin
 
 _left_open: list[int] = []  # descriptors that `close` had no thread for
@@ -190,7 +190,7 @@ def in_use(path: str, holder: Holder | None) -> InUseError:
     if holder and holder.name == GETTY:
         advice = console_advice(path)
         return InUseError(f"{path} is in use by a login console ({GETTY}); {advice}")
-    if holder and holder.name == "acsard" and not is_daemon_here(holder.pid):
+    if holder and is_check_here(holder.pid):
         return InUseError(
             f"{path} is in use by `acsard mcu check` (process {holder.pid}): wait for its end"
         )
