@@ -114,7 +114,7 @@ def _stop_all(robot: Connection, ids: tuple[str, ...], *, as_json: bool) -> int:
     # robots are present, which would delay the stop.
     robot_discovery.stop(robot.session, ids, robot.caller)
     replies = of_each(robot, ids, lambda client: client.call("stop"))
-    silence = "NO ANSWER: go to the robot, or use its emergency switch ({error})"
+    silence = "NO ANSWER: go to the robot, or use its emergency switch"
     code = print_each(replies, robot, ids, silence, as_json=as_json)
     moving = [
         name

@@ -70,17 +70,23 @@ def print_each(
 
     It is `UNREACHABLE` if a robot did not answer, otherwise `NO_PERMISSION` if this client may not
     call one, otherwise `FAILURE` if one refused. `silence` is the text for a robot without an
-    answer, for the reason `{error}`.
+    answer. Each cause of a silence is printed once, below.
     """
     for robot_id, reply in replies.items():
         if isinstance(reply, AcsardError):
             barred = isinstance(reply, NotPermittedError)
-            reply = ServiceReply(False, (BARRED if barred else silence).format(error=reply))
+            reply = ServiceReply(False, BARRED.format(error=reply) if barred else silence)
         line = encode(reply, "json").decode()
         text = printable(f"{robot_id}: {reply.message}")
         print(of_robot(robot_id, line) if as_json else text)
     failed = {name: reply for name, reply in replies.items() if isinstance(reply, AcsardError)}
     silent = [name for name, error in failed.items() if not isinstance(error, NotPermittedError)]
+    # The texts of two robots with the same cause differ only in the id.
+    causes = dict[str, str]()
+    for name in silent:
+        causes.setdefault(str(failed[name]).replace(name, ""), f"{name}: {failed[name]}")
+    for cause in causes.values():
+        print(f"acsard: {printable(cause)}", file=sys.stderr)
     if ALL_ROBOTS in ids:
         answered = count_text(robot.where.endpoint, len(replies) - len(silent))
         without = f"; without an answer: {', '.join(silent)}" if silent else ""

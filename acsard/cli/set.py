@@ -154,7 +154,7 @@ def _set_all(
         return reply if as_json else _with_duration(reply)
 
     replies = of_each(robot, ids, change_one)
-    return print_each(replies, robot, ids, "NO ANSWER: {error}", as_json=as_json)
+    return print_each(replies, robot, ids, "NO ANSWER", as_json=as_json)
 
 
 def _print_settings(config: object, as_json: bool) -> None:

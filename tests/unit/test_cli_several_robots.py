@@ -31,10 +31,21 @@ def test_a_refused_permission_is_no_silence(
     replies: Replies, code: Exit, capsys: pytest.CaptureFixture[str]
 ) -> None:
     robot = cast("Connection", None)
-    assert print_each(replies, robot, [*replies], "NO ANSWER: {error}", as_json=False) == code
+    assert print_each(replies, robot, [*replies], "NO ANSWER", as_json=False) == code
     lines = capsys.readouterr().out.splitlines()
     assert ("b: NOT ALLOWED: role operator" in lines) == (replies.get("b") is BARRED)
-    assert ("b: NO ANSWER: nobody" in lines) == (replies.get("b") is SILENT)
+    assert ("b: NO ANSWER" in lines) == (replies.get("b") is SILENT)
+
+
+def test_a_cause_that_several_robots_have_is_printed_once(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    silent = {name: NoAnswerError(f"no answer of {name}") for name in ("a1", "a2", "a3")}
+    replies: Replies = silent | {"a2": NoAnswerError("closed")}
+    print_each(replies, cast("Connection", None), [*replies], "NO ANSWER", as_json=False)
+    out, err = capsys.readouterr()
+    assert out.splitlines() == [f"{name}: NO ANSWER" for name in replies]
+    assert err.splitlines() == ["acsard: a1: no answer of a1", "acsard: a2: closed"]
 
 
 @pytest.mark.parametrize(
