@@ -284,10 +284,9 @@ def _chosen(args: argparse.Namespace) -> list[Path]:
     name = args.file
     if name is not None and not re.fullmatch(r"\d{1,9}", name):
         if Path(name).suffix in (*ENDINGS.values(), ".html") and not Path(name).exists():
-            verb = "report" if Path(name).suffix == ".html" else "export"
             raise UsageError(
-                f"to write {name}, give the recording's number first: `acsard recording {verb} 1 "
-                f"{name}`; `acsard recording` lists the numbers"
+                f"to write {name}, type the recording's number before it, such as `1 {name}`; "
+                "`acsard recording` lists the numbers"
             )
         return [Path(name)]
     where, files = _files(args)
