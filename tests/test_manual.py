@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import re
 import runpy
+from contextlib import redirect_stdout
+from io import StringIO
 from zipfile import ZipFile
 
 import pytest
@@ -88,7 +90,9 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
     out = tmp_path_factory.mktemp("built") / "manual.zip"
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(manual, "MANUAL", out)
-        runpy.run_path(str(HERE / "build.py"), run_name="__main__")
+        with redirect_stdout(StringIO()) as printed:
+            runpy.run_path(str(HERE / "build.py"), run_name="__main__")
+    assert printed.getvalue().startswith(f"wrote {out}; restart the page")
     with ZipFile(out) as files:
         names = [name for name in files.namelist() if name.endswith((".html", ".ino"))]
         return {name: files.read(name).decode() for name in names}

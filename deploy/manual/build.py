@@ -52,3 +52,4 @@ if __name__ == "__main__":
     from acsard.web.manual import MANUAL
 
     build(MANUAL)
+    print(f"wrote {MANUAL}; restart the page (`acsard run` or `acsard web`)")
