@@ -36,7 +36,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         action="store_true",
         help="print one JSON list with the whole `state` of each robot, and end",
     )
-    add_bus(parser, SEVERAL_IDS + " (the default)")
+    add_bus(parser, SEVERAL_IDS, usual=f"'{ALL_ROBOTS}'")
 
 
 def main(args: argparse.Namespace) -> int:

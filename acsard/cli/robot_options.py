@@ -25,9 +25,15 @@ from acsard.host.errors import UnreachableError, UsageError
 SEVERAL_IDS = "; several ids separated by commas, or '*' for all robots"
 
 
-def add_bus(parser: argparse.ArgumentParser, more: str = "", default: object = None) -> None:
-    """Add the options that select a robot and its daemon's address; `more` help for `--id`.
+def add_bus(
+    parser: argparse.ArgumentParser,
+    more: str = "",
+    default: object = None,
+    usual: str = "robot.id",
+) -> None:
+    """Add the options that select a robot and its daemon's address.
 
+    `usual` and `more` are the help's words for the default of `--id` and for other values.
     With the `default` `argparse.SUPPRESS`, a subcommand keeps the value that stood before it.
     """
     add_config(parser, default)
@@ -39,7 +45,7 @@ def add_bus(parser: argparse.ArgumentParser, more: str = "", default: object = N
             "directory with your certificate, for a tls/ endpoint (default: $ACSARD_TLS, or "
             "bus.tls)",
         ),
-        ("--id", "ID", "the robot's id (default: robot.id)" + more),
+        ("--id", "ID", f"the robot's id (default: {usual}){more}"),
     ):
         parser.add_argument(option, metavar=metavar, default=default, help=text)
 
