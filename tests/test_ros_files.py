@@ -225,6 +225,14 @@ def test_nav2_py_puts_the_robot_s_values_into_nav2_s_file_and_keeps_the_rest(
     assert controller["FollowPath"]["vx_max"] == 1.0
 
 
+def test_nav2_py_without_its_two_files_says_how_it_is_called(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(sys, "argv", ["nav2.py"])
+    with pytest.raises(SystemExit, match=r"python3 nav2\.py NAV2_PARAMS"):
+        runpy.run_path(str(FILES / "nav2.py"))
+
+
 def leaves(tree: dict[str, Any]) -> list[tuple[str, Any]]:
     pairs: list[tuple[str, Any]] = []
     for key, value in tree.items():

@@ -17,5 +17,7 @@ def merged(nav2: Any, robot: Any) -> Any:
     return nav2 | {key: merged(nav2.get(key), value) for key, value in robot.items()}
 
 
+if len(sys.argv) != 3:
+    sys.exit(__doc__)
 nav2, robot = (yaml.safe_load(Path(name).read_text(encoding="utf-8")) for name in sys.argv[1:])
 print(yaml.safe_dump(merged(nav2, robot), sort_keys=False), end="")
