@@ -110,13 +110,10 @@ def warnings(config: Config) -> list[str]:
             "a second robot with this id would use the same keys; give each robot its own id"
         )
     ros = config.ros
-    where = (
-        "that other machines reach" if outside else "with a router" if config.bus.connect else ""
-    )
-    if where and (ros.bridge or ros.rmw) and not ros.namespace:
+    if outside and (ros.bridge or ros.rmw) and not ros.namespace:
         messages.append(
-            f'ros.namespace = "" on a bus {where}: a second robot on this bus would use the same '
-            "ROS topics; give each robot its own namespace"
+            'ros.namespace = "" on a bus that other machines reach: a second robot on this bus '
+            "would use the same ROS topics; give each robot its own namespace"
         )
     return messages + named_faults.warnings(config)
 
