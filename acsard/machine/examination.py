@@ -17,9 +17,10 @@ from msgspec import Struct
 from msgspec.structs import replace
 
 from acsard.bus.address import Address, address_of
+from acsard.bus.tls_files import host_and_port
 from acsard.bus.zenoh_sessions import answers, reachable
 from acsard.client.connection import Connection, open_connection
-from acsard.core.config.contradictions import warnings
+from acsard.core.config.contradictions import is_loopback, warnings
 from acsard.core.config.live import differences
 from acsard.core.config.parsing import ConfigError, from_builtins, parse
 from acsard.core.config.settings import SIMULATOR, Config, is_tls
@@ -29,6 +30,7 @@ from acsard.core.messages.schema import DiagnosticStatus, Info
 from acsard.core.values import NS_PER_S, AcsardError, Seconds
 from acsard.host import clock
 from acsard.host.errors import MendableError, NoAnswerError
+from acsard.host.own_identity import own_addresses
 from acsard.host.processes import is_daemon_here
 from acsard.machine.certificate_findings import certificates, router_certificates
 from acsard.machine.finding import LEVELS, Finding
@@ -248,7 +250,7 @@ def routers(config: Config, running: bool) -> Iterator[Finding]:
         if not running and not answers(endpoint):
             mend = "start the Zenoh router there (rmw_zenohd, zenohd or `acsard router`)"
             yield Finding("router", "warning", f"no program listens at {endpoint}", mend)
-        if not is_tls(endpoint):
+        if not is_tls(endpoint) and _others_reach(endpoint):
             yield Finding(
                 "bus",
                 "warning",
@@ -256,6 +258,11 @@ def routers(config: Config, running: bool) -> Iterator[Finding]:
                 "is connected to that router has the rights of this machine",
                 "let the router listen only on loopback, or let the daemon connect to it over TLS",
             )
+
+
+def _others_reach(endpoint: str) -> bool:
+    host, port = host_and_port(endpoint)
+    return not is_loopback(host) or any(answers(f"tcp/{own}:{port}") for own in own_addresses())
 
 
 def gateway(config: Config) -> Iterator[Finding]:

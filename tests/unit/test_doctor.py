@@ -6,6 +6,7 @@ import os
 import pty
 import re
 import resource
+import socket
 import subprocess
 import sys
 from pathlib import Path
@@ -21,7 +22,7 @@ from acsard.host import real_time
 from acsard.host.errors import CertificateError, NoAnswerError
 from acsard.host.kernel_counters import Kernel
 from acsard.machine import examination, versions
-from acsard.machine.examination import Running, clocks, compared, examine, reported
+from acsard.machine.examination import Running, clocks, compared, examine, reported, routers
 from acsard.machine.finding import Finding
 from acsard.machine.local_findings import scheduling, serial_port, slowness, unused_version
 from acsard.machine.serial_ports import BOARDS
@@ -65,6 +66,24 @@ def test_values_of_command_line_options_are_no_warning() -> None:
     (finding,) = compared(running(runs), FILE)
     assert finding.level == "ok"
     assert "mcu.port = " in finding.text
+
+
+@pytest.mark.parametrize(
+    ("own", "endpoint", "subjects"),
+    [
+        (["127.0.0.1"], "tcp/127.0.0.1:{}", ["bus"]),  # the router listens on this one, too
+        ([], "tcp/127.0.0.1:{}", []),
+        ([], "tcp/router.local:{}", ["bus"]),
+    ],
+)
+def test_a_router_without_tls_is_warned_of_unless_only_this_machine_reaches_it(
+    own: list[str], endpoint: str, subjects: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("acsard.machine.examination.own_addresses", lambda: own)
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        bus = BusConfig(connect=(endpoint.format(server.getsockname()[1]),))
+        found = list(routers(replace(FILE, bus=bus), running=True))
+    assert [finding.subject for finding in found] == subjects
 
 
 def test_the_file_of_another_robot_is_not_compared() -> None:

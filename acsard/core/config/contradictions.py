@@ -103,7 +103,7 @@ def warnings(config: Config) -> list[str]:
             "access.wildcards = true: every client with a certificate can stall the bus"
         )
     hosts = [_host(endpoint) for endpoint in (*config.bus.listening, *config.bus.connect)]
-    outside = not all(_is_loopback(host) for host in hosts if host)
+    outside = not all(is_loopback(host) for host in hosts if host)
     if outside and config.robot.id == Config().robot.id:
         messages.append(
             f'robot.id = "{config.robot.id}" is the default id, but other machines reach the bus: '
@@ -327,7 +327,7 @@ def _endpoint_problems(config: Config, key: str) -> list[str]:
                     f"{where}: needs certificates; `acsard tls init` makes them and prints the "
                     "bus.tls to write"
                 )
-        elif not _is_loopback(host) and not bus.insecure:
+        elif not is_loopback(host) and not bus.insecure:
             errors.append(
                 f"{where}: this endpoint is on the network, without encryption or access "
                 "control; choose one: (1) write 127.0.0.1, and connect a laptop through an "
@@ -351,7 +351,7 @@ def _page_problems(config: Config) -> list[str]:
         host, _, port = place.rpartition(":")
         if not 0 < int(port) < 65536:
             errors.append(f"{where}: a port is a number from 1 to 65535")
-        elif scheme == "http" and not _is_loopback(host.strip("[]")):
+        elif scheme == "http" and not is_loopback(host.strip("[]")):
             errors.append(
                 f"{where}: http is only for this machine; write 127.0.0.1, or https:// with the "
                 "robot's certificate, like https://0.0.0.0:8443"
@@ -408,7 +408,7 @@ def _host(endpoint: str) -> str | None:
     return host.strip("[]") if good else None
 
 
-def _is_loopback(host: str) -> bool:
+def is_loopback(host: str) -> bool:
     if host == "localhost":
         return True
     try:
