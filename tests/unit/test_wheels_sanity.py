@@ -23,10 +23,10 @@ def only(wheel: int, speed: float, others: float = 0.0) -> WheelSpeeds:
 
 def line(speed: float, wheel: int = 1, others: float = 0.0, **more: Any) -> Feedback:
     """Return a line with the speed of one wheel; `step` is that of all encoders."""
-    proven = more.pop("proven", False)  # the step was found by whole counts
-    more.setdefault("counted", (0.0,) * 4 if proven else None)
-    steps, dt = (more.pop("step", 0.0),) * 4, more.pop("dt", 0.01)
-    return Feedback(Instant(0, 0), only(wheel, speed, others), dt, steps=steps, **more)
+    speeds, step, dt = only(wheel, speed, others), more.pop("step", 0.0), more.pop("dt", 0.01)
+    if more.pop("proven", False):  # the line has whole counts
+        more |= {"counted": tuple(dt * each for each in speeds.as_tuple()), "count": step * dt}
+    return Feedback(Instant(0, 0), speeds, dt, steps=(step,) * 4, **more)
 
 
 def lines(*speeds: float, **more: Any) -> list[Feedback]:
@@ -70,7 +70,29 @@ ROWS: dict[str, Row] = {
     "two fine counts": (80, 100, lines(0, 4.0, step=0.5), ".."),
     "one proven count": (40, 1500, lines(70, 71.5, step=31.4, proven=True), ".x"),
     "the limit and a proven count": (40, 1500, lines(71.25, step=31.25, proven=True), "."),
-    "the limit and a learned step": (5, 1500, lines(11.54, -11.54, 11.55, **COARSE), "..x"),
+    "the limit and a learned step": (
+        5, 1500, lines(11.54, 0, 0, -11.54, 0, 0, 11.55, **COARSE), "......x",
+    ),
+    # Speeds over the limit are summed as angles: one count excuses once, not in every line.
+    "lasting speeds": (80, 1500, [ten(95, step=31.4)] * 5, "..xxF"),
+    "lasting speeds by counts": (
+        80, 1500, [ten(95, count=0.314, counted=(0.942,) * 4)] * 5, "..xxF",
+    ),
+    "lasting speeds, unknown": (10, 1500, [ten(39, step=UNKNOWN)] * 4, ".xxF"),
+    "what slow lines make up for": (80, 1500, lines(95, 95, 50, step=31.4) * 5, "." * 15),
+    "what they do not": (
+        80, 1500, lines(95, 79.9, 95, 79.9, 95, 95, 79, 95, step=31.4), "....xx.x",
+    ),
+    "an impossible line adds nothing": (80, 1500, lines(95, 99.99, 70, 94, step=20), ".x.."),
+    "nor does a jump": (20, 500, lines(30, -30, 29, step=20), ".x."),
+    "a repeated line": (
+        80, 1500, [ten(95, count=0.314, counted=(0.942 * (i % 2),) * 4) for i in range(5)],
+        "..xxF",
+    ),
+    "the sum ends at a gap": (
+        80, 1500, [ten(95, step=31.4), ten(95, step=31.4), ten(95, **GAP, step=31.4)], "...",
+    ),
+    "no step above one count of 16": (20, 1500, [ten(70, step=60)], "x"),
     "damage before fast lines": (
         20, 1500, lines(70, 21, 21, 21, 10.5, 10.5, step=10.5) * 10, "x....." * 10,
     ),
@@ -81,7 +103,6 @@ ROWS: dict[str, Row] = {
         80, 1500, lines(98.17, 98.17, 0, 98.17, dt=0.00333, step=98.17), "....",
     ),
     "unknown, but over the limit": (80, 1500, lines(0, 79.9, 80.1, step=UNKNOWN), "..x"),
-    "unknown, and a proven count": (80, 1500, [line(80.1, step=UNKNOWN, proven=True)], "x"),
     "unknown, from the first line": (80, 1500, lines(99, 99, 99, step=UNKNOWN), "xxF"),
     # One count of 16 in 10 ms is 39.27 rad/s; a higher speed comes from a damaged digit.
     "unknown, one count of 16": (10, 1500, lines(39.26, 4, step=UNKNOWN), ".."),
@@ -125,6 +146,10 @@ def test_forgetting_starts_over_but_the_last_line_is_still_compared() -> None:
     sanity.forget()
     assert not sanity.doubtful
     assert verdicts(sanity, lines(79, 0)) == "x."
+    sanity, fast = Sanity(), [ten(95, step=31.4)] * 2
+    assert verdicts(sanity, fast) == ".."
+    sanity.forget()
+    assert verdicts(sanity, fast) == ".."
 
 
 @each("number", [1, 2])

@@ -4,8 +4,8 @@ A line in which a wheel turns, or changes its speed, faster than any wheel can i
 several in a row are a fault. More than one in a hundred is a warning: damage on the wire, or a
 limit in `[feedback]` that is too low. A damaged plain line may look possible, and then the true
 ones look impossible. So a possible line is trusted only if it agrees with the one before it, and
-two later lines that agree outvote it. Each limit is widened by the quantization step: one count in
-a short time looks like a high speed.
+two later lines that agree outvote it. One count in a short time looks like a high speed, so a
+change may be larger by quantization steps, and speeds over the limit may add up to one count.
 """
 
 from __future__ import annotations
@@ -31,14 +31,16 @@ MAX_WHEEL_ACCELERATION = 1500.0  # rad/s2, more than any real wheel's
 
 COUNT_MARGIN = 2  # each of two reports may be wrong by one
 
-# Of the coarsest expected encoder, rad. Until the steps are learned, it excuses a speed over
-# `feedback.wheel_speed`.
+# Of the coarsest expected encoder, rad. No learned step excuses more, and until the steps are
+# learned, a line with a speed over `feedback.wheel_speed` has this at most.
 COARSEST_COUNT = math.tau / 16
 
 MIN_COUNT_S = 0.004  # boards that are asked more often repeat their speeds
 
 # Least time between two lines: while this computer catches up, one count would look fast.
 MIN_INTERVAL_S = 0.004
+
+NOT_FAST: Motors = (0.0, 0.0, 0.0, 0.0)
 
 
 class Sanity(Struct):
@@ -55,13 +57,16 @@ class Sanity(Struct):
     since: float = 0.0  # s since `last`
     longest: float = 0.0  # s that a recent line covers (recent for as long)
     count: int = 0  # of the last impossible lines
+    # By how much each wheel turned further than at the limit, rad: the sum over possible lines,
+    # which slower ones reduce. It is one count at most.
+    beyond: Motors = NOT_FAST
     lines: int = 0  # of the window
     dropped: int = 0  # impossible ones of the window
     warning: Event | None = None  # only if the last line caused it
 
     def forget(self) -> None:
         """Start over after a lost link or a cleared fault; the last line is not trusted."""
-        self.trusted, self.count = False, 0
+        self.trusted, self.count, self.beyond = False, 0, NOT_FAST
 
     @property
     def doubtful(self) -> bool:
@@ -80,7 +85,7 @@ class Sanity(Struct):
         longest = self.longest - since if self.longest > since else 0.0
         self.longest = longest if longest > since else since
         if feedback.gap:
-            self.last = None
+            self.last, self.beyond = None, NOT_FAST
             self.rejected.clear()
         speeds, last = feedback.speeds, self.last
         wheels = speeds.as_tuple()
@@ -88,7 +93,9 @@ class Sanity(Struct):
         why = ""
         # Every wheel can change by `SPEED_MARGIN` at once.
         sudden = change > SPEED_MARGIN
-        if max(map(abs, wheels)) > fastest or (sudden and change > self._most(self.since, longest)):
+        beyond = self.beyond  # an impossible line does not change it
+        over = beyond is not NOT_FAST or max(map(abs, wheels)) > fastest
+        if over or (sudden and change > self._most(self.since, longest)):
             # Only few lines need the quantization steps.
             most = self._most(self.since, longest)
             why = self._too_fast(feedback, fastest)
@@ -101,6 +108,7 @@ class Sanity(Struct):
         self.lines += 1
         self.warning = None
         if why:
+            self.beyond = beyond
             self.dropped += 1
             self.count += 1
             if self.dropped == int(WARNING_FRACTION * WINDOW_LINES) + 1:
@@ -139,23 +147,24 @@ class Sanity(Struct):
         )
 
     def _too_fast(self, line: Feedback, fastest: RadPerS) -> str:
-        wheels, turned = line.speeds.as_tuple(), _proven(line)
-        own = line.dt - line.bridged
-        # A line without a known time moves nothing, so no count in it is excused.
-        coarsest = COARSEST_COUNT / max(own, MIN_COUNT_S) if own > 0.0 else 0.0
+        turned, own = _proven(line), line.dt - line.bridged
+        usual = max(own, MIN_COUNT_S)
         # While other wheels rest, damaged lines of one wheel look like the steps of its encoder.
         learned = max(line.steps) < math.inf
-        for name, now, step, angle in zip(
-            WHEELS, wheels, line.steps, turned or wheels, strict=True
-        ):
-            size = abs(now)
-            if line.count and turned is not None:
-                # Of n reported counts, n - 1 certainly occurred in the time of the line.
-                most = fastest + (size * min(1.0, line.count / abs(angle)) if angle else size)
-            else:
-                most = fastest + step if learned else max(fastest, coarsest)
-            if size > most:
-                return f"{name} at {now:.2f} rad/s is over feedback.wheel_speed"
+        # A line without a known time moves nothing, so no count in it is excused.
+        most = max(fastest, COARSEST_COUNT / usual if own > 0.0 else 0.0)
+        beyond, speeds = list(self.beyond), line.speeds.as_tuple()
+        for wheel, (now, step) in enumerate(zip(speeds, line.steps, strict=True)):
+            size, time, count = abs(now), usual, min(step * usual, COARSEST_COUNT)
+            if turned is not None:
+                count = line.count
+                if now and turned[wheel]:
+                    time = abs(turned[wheel]) / size  # in which the board has counted
+            over = beyond[wheel] = max(0.0, beyond[wheel] + (size - fastest) * time)
+            if size > fastest and (over > count or not (learned or size <= most)):
+                return f"{WHEELS[wheel]} at {now:.2f} rad/s is over feedback.wheel_speed"
+        a, b, c, d = beyond
+        self.beyond = (a, b, c, d) if any(beyond) else NOT_FAST
         return ""
 
     def _jump(self, line: Feedback, before: WheelSpeeds, most: float) -> str:
