@@ -293,7 +293,8 @@ A robot that connects to a router uses it for its next connection. For a service
 """
 
 _LINES = """\
-Write into acsard.toml on the robot (--write FILE does this for you):
+For a fleet go on with `acsard tls add` (page howto/fleet of the manual). For one robot write into
+acsard.toml there (--write FILE does this for you):
 
 [bus]
 listen = {listen}
