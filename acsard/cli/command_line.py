@@ -173,6 +173,9 @@ def main(argv: list[str] | None = None) -> int:
                 print(f"acsard: {error}", file=sys.stderr)
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return code or Exit.FAILURE
+    except UnicodeEncodeError as error:
+        print(f"acsard: an argument is not valid UTF-8: {error.object!a}", file=sys.stderr)
+        return Exit.USAGE
     except KeyboardInterrupt:
         return 130
     return code

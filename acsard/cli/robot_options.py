@@ -61,7 +61,8 @@ def robot_address(args: argparse.Namespace) -> Address:
     """Return the address of the robot that the options name. Raises `UsageError` for several."""
     require_one(args)
     _, config = load(args.config)
-    _require_named(args, config)
+    if not _names_a_robot(args, config):
+        raise _no_robot_named(config)
     return address_of(config, args.connect, args.id, args.tls)
 
 
@@ -79,19 +80,16 @@ def require_one(args: argparse.Namespace) -> None:
         )
 
 
-def _require_named(args: argparse.Namespace, config: Config) -> None:
+def _names_a_robot(args: argparse.Namespace, config: Config) -> bool:
     # A file with `[fleet] robots` and without robot.id is not a robot's: "acsar" is no robot there.
     robots, default = config.fleet.robots, Config().robot.id
-    if args.id is not None or config.robot.id != default or not robots or default in robots:
-        return
-    if getattr(args, "service", "") == "stop":
-        raise UsageError(
-            "no robot is named, nothing was stopped: `acsard call stop --id '*'` stops all, "
-            f"`--id {robots[0]}` one"
-        )
-    raise UsageError(
-        f"no robot is named: add one of [fleet] robots, such as `--id {robots[0]}`; `acsard fleet` "
-        "lists them"
+    return args.id is not None or config.robot.id != default or not robots or default in robots
+
+
+def _no_robot_named(config: Config) -> UsageError:
+    return UsageError(
+        f"no robot is named: add one of [fleet] robots, such as `--id {config.fleet.robots[0]}`; "
+        "`acsard fleet` lists them"
     )
 
 
@@ -104,7 +102,11 @@ def connected_to_many(args: argparse.Namespace) -> Iterator[tuple[Connection, tu
     """
     many = several_ids(args)
     _, config = load(args.config)
-    _require_named(args, config)
+    if not _names_a_robot(args, config):
+        # One stop too many is better than one too few.
+        if getattr(args, "service", "") != "stop":
+            raise _no_robot_named(config)
+        many = (ALL_ROBOTS,)
     if ALL_ROBOTS in many:
         many += config.fleet.robots
     where = address_of(config, args.connect, None if many else args.id, args.tls)

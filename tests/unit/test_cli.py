@@ -176,3 +176,8 @@ def test_an_interrupted_drive_prints_how_far_it_came_and_what_is_wrong(
 )
 def test_an_address_of_this_machine_is_taken(text: str, address: tuple[str, int]) -> None:
     assert foxglove.loopback(text) == address
+
+
+def test_an_argument_that_is_not_utf_8_is_named(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["run", "--id", "a\udcff"]) == 2
+    assert "an argument is not valid UTF-8: 'a\\udcff'" in capsys.readouterr().err
