@@ -142,7 +142,6 @@ def test_doctor_uses_the_running_daemon_s_values_and_reports_where_the_file_diff
             finding for finding in findings["configuration"] if "other values" in finding["text"]
         ]
         assert other["level"] == "ok"  # it is intentional: the manual says so
-        assert f'[mcu] port = "{peer.path}"' in other["mend"]
         # A long value is cut in the text.
         assert f'mcu.port = "{str(peer.path)[:40]}' in other["text"]
         assert 'not "sim"' in other["text"]
