@@ -17,7 +17,8 @@ from acsard.core.motion.wheels import (
     count_angle,
 )
 from acsard.core.simulator.faults import Fault
-from acsard.core.values import NS_PER_S, WHEELS
+from acsard.core.simulator.protocol import speeds_text
+from acsard.core.values import NS_PER_S, WHEELS, Received
 from tests.scenarios.world import World
 
 
@@ -26,6 +27,25 @@ def world() -> World:
     world = World()
     world.run(0.2)
     return world
+
+
+def damage(world: World, every: int, speeds: tuple[float, ...]) -> list[int]:
+    """Replace each so-many-th line by one with these speeds; return a list of their number."""
+    feed, seen, damaged = world.port.feed, 0, [0]
+    text = speeds_text(speeds, world.mcu.separator, False) + b"\r\n"
+
+    def fed(received: Received) -> None:
+        nonlocal seen
+        data = b""
+        for line in received.data.splitlines(keepends=True):
+            seen += 1
+            hit = seen % every == 0 and not line.startswith((b"!", b"?"))
+            damaged[0] += hit
+            data += text if hit else line
+        feed(Received(received.at, data))
+
+    world.port.feed = fed  # type: ignore[method-assign]
+    return damaged
 
 
 def stopped(world: World) -> bool:
@@ -51,6 +71,39 @@ def test_a_faulty_encoder_stops_the_robot_and_is_named(world: World, wheel: int,
     assert world.call("clear").success
     world.drive(0.5, seconds=1.0)
     assert world.state.mode == "driving"
+
+
+@pytest.mark.parametrize(("configured", "real"), [(0, 20), (20, 20), (0, 3200)])
+@pytest.mark.parametrize("drives", [False, True])
+@pytest.mark.parametrize("speed", [95.0, 99.99])
+def test_lasting_impossible_speeds_are_a_fault_although_one_count_is_excused(
+    configured: int, real: int, drives: bool, speed: float
+) -> None:
+    mcu = McuConfig(encoder_counts=configured)
+    world = World(Config(mcu=mcu, sim=SimConfig(encoder_counts=real)))
+    world.run(0.5)
+    world.drive(0.5, seconds=2.0)
+    world.hold(0.5 if drives else 0.0, seconds=2.0)
+    began = world.state.x
+    damage(world, every=1, speeds=(speed,) * 4)
+    world.hold(0.5 if drives else 0.0, seconds=0.15)
+    assert world.state.code == "impossible_speeds"
+    assert abs(world.state.x - began) < 0.3
+
+
+@pytest.mark.parametrize("speed", [95.0, 99.99])
+@pytest.mark.parametrize("drives", [False, True])
+@pytest.mark.parametrize("every", [20, 50])
+def test_impossible_lines_do_not_teach_that_the_encoders_are_coarse(
+    speed: float, drives: bool, every: int
+) -> None:
+    world = World()
+    world.run(0.5)
+    world.drive(0.3 if drives else 0.0, seconds=1.0)
+    damaged = damage(world, every=every, speeds=(speed, 6.0, 6.0, speed))
+    world.hold(0.3 if drives else 0.0, seconds=12.0)
+    assert world.state.counters["line_implausible"] == damaged[0] > 20
+    assert abs(world.state.yaw) < 0.05
 
 
 @pytest.mark.parametrize("speeds_up", [False, True])

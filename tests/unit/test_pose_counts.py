@@ -70,6 +70,7 @@ def test_without_configured_counts_no_line_has_whole_counts_and_coarse_lines_are
         recovery = CountRecovery()
         for speeds, _ in lines(counts):
             line = recovery.recover_counts(Feedback(AT, WheelSpeeds(*speeds), PERIOD), 0.0)
+            recovery.learn(line)
             assert line.counted is None
         assert recovery.counts(0) == (0,) * 4
         assert (recovery.coarse_lines > 1000) == coarse == bool(recovery.coarse_lines)

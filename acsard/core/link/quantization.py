@@ -87,7 +87,7 @@ class CountRecovery(Struct):
         return (configured if self.whole.doubt < MAX_DOUBT else 0,) * 4
 
     def recover_counts(self, line: Feedback, angle: Rad, shown: bool = True) -> Feedback:
-        """Return a good line with `counted`, `steps` and `count`.
+        """Return a good line with `counted`, `steps` (by the lines before) and `count`.
 
         `angle` is that of one count, rad, or 0 if the counts are not configured; `shown`: the
         speeds show whole counts. If these include the motion of a missing line before it, `bridged`
@@ -104,6 +104,13 @@ class CountRecovery(Struct):
             # One count is a step of this size; none is learned.
             step = angle / elapsed_s if elapsed_s > 0.0 else 0.0
             return replace(line, counted=counted, steps=(step, step, step, step), count=angle)
+        return replace(line, steps=self.steps)
+
+    def learn(self, line: Feedback) -> None:
+        """Learn the steps of a line whose speeds are possible, unless the counts are configured."""
+        if line.count:
+            return
+        elapsed_s, speeds = line.dt - line.bridged, line.speeds.as_tuple()
         a, b, c, d = self.wheels
         a.add(speeds[0])
         b.add(speeds[1])
@@ -116,4 +123,3 @@ class CountRecovery(Struct):
             self.steps = min(a.size, most), min(b.size, most), min(c.size, most), min(d.size, most)
         if elapsed_s < MAX_INTERVAL_S and COARSE_ANGLE < max(self.steps) * elapsed_s < math.inf:
             self.coarse_lines += 1
-        return replace(line, steps=self.steps)
