@@ -293,6 +293,16 @@ def test_a_bus_that_is_locked_costs_messages_and_no_period(
     assert counters["bus_stuck"] >= 1
 
 
+@pytest.mark.nightly
+@pytest.mark.parametrize("form", ["many", "subscribe"])
+def test_wildcards_of_a_client_do_not_disturb_a_robot_behind_the_gateway(
+    tmp_path: Path, gateway: Gateway, form: str
+) -> None:
+    # The gateway's tables are cleaned at the machine's speed, 1.7 s on a fast one; newcomers wait.
+    network = gateway.network(wildcards=True)
+    undisturbed(Robot(tmp_path, network).attacked(form, "viewer"), back_s=3 * BACK_S)
+
+
 def test_a_client_that_takes_all_connections_is_named_in_the_log_and_counted(
     tmp_path: Path, gateway: Gateway
 ) -> None:

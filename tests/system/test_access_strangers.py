@@ -188,10 +188,17 @@ def connection():
     return socket.create_connection((host, int(port)), timeout=0.1)
 
 done, held = 0, []
-visitor = session() if kind == "huge" else None
+visitor = session() if kind in ("flood", "huge") else None
 print("begun", flush=True)
 end = time.monotonic() + seconds
-if kind == "huge":
+if kind == "flood":
+    twist = b'{"linear": {"x": 0.0}, "angular": {"z": 0.0}}'
+    keys = ("cmd/app", "cmd/ghost", "stop/x", "srv/stop", "more")
+    puts = [visitor.declare_publisher("acsard/acsar/" + key).put for key in keys]
+    while time.monotonic() < end:
+        for put in puts:
+            put(twist)
+elif kind == "huge":
     big, block = bytes(200 * 2**20), zenoh.CongestionControl.BLOCK
     while not done or time.monotonic() < end:
         visitor.put("acsard/acsar/cmd/app", big, congestion_control=block)
@@ -267,6 +274,7 @@ BOTH: tuple[Identity, ...] = ("local", "operator")
 @pytest.mark.parametrize(
     ("kind", "count", "comers", "entered_s"),
     [
+        pytest.param("flood", 0, BOTH, 2.0, marks=pytest.mark.nightly),
         ("huge", 0, BOTH, 2.0),
         ("idle", 300, BOTH, 2.0),
         # Zenoh 1.10 waits 100 ms after each TLS handshake that fails (its issue 2685). No setting

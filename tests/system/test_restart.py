@@ -198,6 +198,39 @@ def test_a_latched_robot_stays_at_rest_after_each_restart_until_it_is_released(
     restarted(robot, End("stop", "kill"), End("fault", "crash"), End("inactive", "abort"))
 
 
+SLOW_DISK = """\
+import os, time
+replace = os.replace
+def slow(source, target):
+    if os.path.exists(os.environ["SLOW"]):
+        time.sleep(0.5)
+    replace(source, target)
+os.replace = slow
+"""
+"""Put into the daemon: while the file $SLOW exists, each replacement of a file takes 0.5 s."""
+
+
+@pytest.mark.nightly
+@pytest.mark.slow
+def test_the_answer_of_a_stop_says_that_a_slow_disk_has_not_stored_it_yet(
+    tmp_path: Path, peer: Peer
+) -> None:
+    (disk := tmp_path / "disk").mkdir()
+    (disk / "sitecustomize.py").write_text(SLOW_DISK)
+    slow = tmp_path / "slow"
+    env = environment(PYTHONPATH=f"{disk}:{ROOT}", SLOW=str(slow))
+    with Daemon(tmp_path, peer.path, env=env) as daemon, Bus(daemon.endpoint) as bus:
+        bus.linked()
+        slow.touch()
+        answer = bus.get("srv/stop")
+        assert answer["success"]
+        assert "not on the disk yet" in answer["message"]
+        slow.unlink()
+        file = daemon.states / "acsar.latches.json"
+        until(lambda: "stopped by" in file.read_text(), 5.0, "the disk has the stop")
+        assert "not on the disk yet" not in bus.get("srv/stop")["message"]
+
+
 @pytest.mark.slow
 def test_a_state_directory_that_takes_no_file_starts_the_robot_stopped_and_says_so(
     tmp_path: Path, peer: Peer
