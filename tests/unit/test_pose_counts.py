@@ -68,6 +68,8 @@ def lines(
 def test_without_configured_counts_no_line_has_whole_counts_and_coarse_lines_are_counted() -> None:
     for counts, coarse in ((20, True), (3200, False)):
         recovery = CountRecovery()
+        first = recovery.recover_counts(Feedback(AT, WheelSpeeds(), PERIOD), 0.0)
+        assert first.steps == (math.inf,) * 4
         for speeds, _ in lines(counts):
             line = recovery.recover_counts(Feedback(AT, WheelSpeeds(*speeds), PERIOD), 0.0)
             recovery.learn(line)

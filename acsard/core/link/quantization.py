@@ -31,7 +31,7 @@ MAX_STEP_RATIO = 3.0
 # Of a count. Over a longer time than this, a change of speed is an acceleration.
 COARSE_ANGLE, MAX_INTERVAL_S = math.tau / 200, 0.03
 
-NO_STEPS = (0.0, 0.0, 0.0, 0.0)
+UNKNOWN = (math.inf,) * 4
 
 
 class Steps(Struct):
@@ -73,14 +73,14 @@ def _unknown() -> tuple[Steps, Steps, Steps, Steps]:
 class CountRecovery(Struct):
     whole: WholeCounts = field(default_factory=WholeCounts)
     wheels: tuple[Steps, Steps, Steps, Steps] = field(default_factory=_unknown)
-    learned: Motors = NO_STEPS
-    steps: Motors = NO_STEPS  # limited by `MAX_STEP_RATIO`
+    learned: Motors = UNKNOWN
+    steps: Motors = UNKNOWN  # limited by `MAX_STEP_RATIO`
     coarse_lines: int = 0  # with a coarse encoder and no configured counts
 
     def forget(self) -> None:
         """Forget all earlier lines: the board has restarted or was replaced."""
         self.whole, self.wheels = WholeCounts(), _unknown()
-        self.learned = self.steps = NO_STEPS
+        self.learned = self.steps = UNKNOWN
 
     def counts(self, configured: int) -> tuple[int, ...]:
         """Return the configured counts per turn; all 0 if the speeds contradict them."""
