@@ -56,6 +56,19 @@ def test_what_wrong_counts_moved_before_they_were_noticed_is_a_doubt(
     assert sigmas(robot) < 3.0
 
 
+@pytest.mark.parametrize("configured", [100, 400])
+def test_lines_are_not_judged_by_counts_that_are_wrong(configured: int) -> None:
+    robot = world(20, "on", configured)
+    robot.run(0.5)
+    robot.drive(0.5, 0.0, 1.0)
+    before = robot.state.counters.get("line_implausible", 0)
+    robot.hold(0.5, 0.0, 7.0)
+    robot.hold(0.0, 0.0, 1.0)
+    assert robot.state.pose_doubt == "encoder_counts_wrong"
+    assert robot.state.counters.get("line_implausible", 0) == before
+    assert sigmas(robot) < 3.0
+
+
 def test_right_counts_are_used_from_the_first_second_of_driving() -> None:
     robot = world(3200, "on")
     drive(robot, 3.0)

@@ -438,7 +438,8 @@ class McuSession(Struct):
         feedback = timeline.place(setup, speeds, reading, following, length, silent, asked_ns)
         if setup.checked:
             self._check_samples(reading)
-        return self.count_recovery.recover_counts(feedback, setup.count, setup.shows_counts)
+        count = setup.count if timeline.counts_check.agrees else 0.0
+        return self.count_recovery.recover_counts(feedback, count, setup.shows_counts)
 
     def _refuse(self, setup: LinkSetup, line: bytes, error: FrameError) -> None:
         if error.reason == "repeated":
