@@ -115,6 +115,8 @@ def test_after_a_guided_drive_the_person_says_whether_its_result_is_written(
 ) -> None:  # fmt: skip
     monkeypatch.chdir(tmp_path)
     file = tmp_path / "acsard.toml"
+    # The package has installed a file in /etc.
+    monkeypatch.setattr("acsard.host.config_file.SEARCH_PATHS", (file,))
     if text:
         file.write_text(text)
     questions = []
