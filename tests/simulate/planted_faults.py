@@ -472,10 +472,11 @@ FAULTS = (
           EMERGENCY_STOP, "        for at_ns, status in reports:\n",
           "        for at_ns, status in [*reports][-1:]:\n"),
     fault("estop late", "a pressed emergency stop waits up to 25 ms for its first zero", LOOP,
-          "            due = tick or (news.urgent and pace.at_once(now.mono_ns, port.sent_ns))\n",
-          "            due = tick or (news.urgent and pace.at_once(now.mono_ns, port.sent_ns))\n"
-          "            late = now.mono_ns % 10**8 < 25 * 10**6\n"
-          "            due = due and not (robot._inputs.estop.is_pressed and late)\n"),
+          "            if due:\n                line = robot.drive(now)\n",
+          "            late = robot._inputs.estop.is_pressed and now.mono_ns % 10**8 < 25 * 10**6\n"
+          "            due = due and not late\n"
+          "            if due:\n                line = robot.drive(now)\n",
+          (LOOP, "None, news.urgent,", "None, news.urgent and not late,")),
     fault("estop clear", "a clear works while the emergency stop is pressed", LIFECYCLE,
           "        if self.held:\n", "        if False:\n"),
     fault("estop silent", "a robot drives for 2 s without reports of its emergency stop",
