@@ -476,7 +476,7 @@ FAULTS = (
           "            late = robot._inputs.estop.is_pressed and now.mono_ns % 10**8 < 25 * 10**6\n"
           "            due = due and not late\n"
           "            if due:\n                line = robot.drive(now)\n",
-          (LOOP, "None, news.urgent,", "None, news.urgent and not late,")),
+          Edit(LOOP, "None, news.urgent,", "None, news.urgent and not late,")),
     fault("estop clear", "a clear works while the emergency stop is pressed", LIFECYCLE,
           "        if self.held:\n", "        if False:\n"),
     fault("estop silent", "a robot drives for 2 s without reports of its emergency stop",
