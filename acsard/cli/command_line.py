@@ -92,6 +92,12 @@ class _Parser(argparse.ArgumentParser):
         try:
             super()._check_value(action, value)
         except argparse.ArgumentError as error:
+            if action.dest == "verb":
+                from acsard.cli.call import CALLABLE_SERVICES  # slow, and only this error needs it
+
+                if value in CALLABLE_SERVICES:
+                    error.message = f"invalid choice: {value!r}; type `acsard call {value}`"
+                    raise
             near = nearest(str(value), map(str, action.choices or ()))
             if near:
                 error.message = f"invalid choice: {value!r}; did you mean {near[0]}?"
