@@ -164,10 +164,13 @@ def test_lines_of_odometry_have_the_same_width_and_no_number_makes_them_long() -
         assert len("".join(place(value, value, 0.0) + speeds(value, value))) < 80
 
 
-def test_a_stopped_robot_says_why_once_and_with_the_numbers_that_clear_takes() -> None:
+def test_a_stopped_robot_says_why_once_with_its_code_and_the_numbers_that_clear_takes() -> None:
     causes = [Cause(n, "stop", "stopped", "", "", Time(), False, None) for n in (7, 12)]
     state = replace(STATE, mode="stopped", reason="stopped by ann", code="stopped")
-    assert short(state).endswith("  stopped by ann")
-    assert short(replace(state, causes=causes)).endswith("  stopped by ann (causes 7, 12)")
-    assert short(replace(state, causes=causes[:1])).endswith("  stopped by ann (cause 7)")
-    assert short(replace(state, reason="battery low")).endswith("  stopped: battery low")
+    assert short(state).endswith("  stopped by ann [stopped]")
+    assert short(replace(state, causes=causes)).endswith("ann [stopped] (causes 7, 12)")
+    assert short(replace(state, causes=causes[:1])).endswith("ann [stopped] (cause 7)")
+    low = replace(state, reason="battery low", code="battery_empty")
+    assert short(low).endswith("  stopped: battery low [battery_empty]")
+    assert short(replace(low, code="later")).endswith("  stopped: battery low [later]")
+    assert short(replace(low, code="")).endswith("  stopped: battery low")

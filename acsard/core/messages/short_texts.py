@@ -55,7 +55,8 @@ def _odometry(odom: Odometry) -> list[str]:
 
 
 def _state(state: RobotState) -> list[str]:
-    why = printable(mode_and_reason(state))
+    code = f" [{state.code}]" if state.code else ""
+    why = printable(after_mode(state.mode, state.reason) + code + cause_numbers(state))
     parts = [*place(state.x, state.y, state.yaw), *speeds(state.linear, state.angular), why]
     left = charge(state.battery)
     problems = "; ".join(map(str, warnings(state)))
