@@ -346,7 +346,7 @@ class Robot:
             if warning is not None:
                 events.append(warning)
         if link != "up":
-            if before == "up":
+            if before == "up" and not self._life.port_released:
                 self.counters["link_lost"] += 1
                 if session.lateness.late_s:
                     self.counters["link_lost_host_stall"] += 1

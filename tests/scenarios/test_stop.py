@@ -66,6 +66,9 @@ def test_the_port_is_released_at_rest_until_the_next_activate() -> None:
     world.hold(0.0, seconds=2.0)
     assert world.call("deactivate", RELEASE).success
     assert (world.state.mode, world.port.released) == ("inactive", True)
+    world.run(1.0)
+    assert world.state.link == "down"
+    assert "link_lost" not in world.state.counters  # lent, not lost
     assert world.call("activate").success
     world.run(1.0)
     assert (world.state.mode, world.port.released) == ("ready", False)
