@@ -90,6 +90,8 @@ limits_zero
     -> set a higher limit
 no_command
     waiting for a command: no source has sent a usable one within its timeout
+    -> send commands, for example with `acsard drive`; if your program sends them, `acsard top`
+    shows why they are refused
 nothing
 command
     a command
@@ -157,12 +159,15 @@ shutting_down
     the daemon is shutting down
 switched_off
     switched off by {by}
+    -> type `acsard call activate`
 other_version
     {cause} ({named})
 stopped
     stopped by {by}
+    -> look at the robot, and type `acsard call clear`
 stopped_at_start
     stopped when the daemon started, because {cause}
+    -> look at the robot, and type `acsard call clear`
 emergency_stop
     emergency stop pressed at the robot
     -> release it at the robot

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import get_args
 
 import acsard
-from acsard.core.codes import CODES, Code, StateCode, joined, reason, sentence
+from acsard.core.codes import CODES, Code, StateCode, StopCode, joined, reason, sentence
 from acsard.recording.file import SUFFIX, Recording
 from tests import recordings
 
@@ -49,3 +49,8 @@ def test_every_text_and_every_advice_is_a_sentence_that_needs_only_known_values(
         assert not re.search(r"[;:]$|  ", why.text)
         assert joined(reason(code, "", **VALUES)).text == why.text
     assert names == set(VALUES)
+
+
+def test_each_stop_and_each_reason_to_rest_says_what_to_do() -> None:
+    for code in (*get_args(StopCode), "switched_off", "no_command"):
+        assert CODES[code].advice, code

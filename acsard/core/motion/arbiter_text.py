@@ -6,7 +6,7 @@ from functools import lru_cache
 
 from msgspec import Struct
 
-from acsard.core.codes import Reason, sentence
+from acsard.core.codes import Reason, reason, sentence
 from acsard.core.formatting import many
 from acsard.core.motion.arbiter import Choice
 from acsard.core.motion.modes import Mode
@@ -32,7 +32,8 @@ def chosen(choice: Choice) -> Reason:
             return waiting(choice.wait)
 
 
-NO_COMMAND, NOTHING, COMMAND = sentence("no_command"), sentence("nothing"), sentence("command")
+NO_COMMAND = reason("no_command")  # without its advice: a robot that waits is in no trouble
+NOTHING, COMMAND = sentence("nothing"), sentence("command")
 
 
 # A format string takes longer than the cache, and a driving robot needs this text in every step.
