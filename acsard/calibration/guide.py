@@ -18,7 +18,7 @@ from msgspec.structs import replace
 from acsard.bus.zenoh_sessions import client_session
 from acsard.calibration.leg import Recorder
 from acsard.calibration.log import Log, LogError, Run, TapeReading
-from acsard.calibration.plan import METHODS, WHEELBASE, Leg, Setup, legs
+from acsard.calibration.plan import METHODS, STAY, WHEELBASE, Leg, Setup, legs
 from acsard.client.connection import Connection
 from acsard.client.ride import NEVER_DRIVING_MODES
 from acsard.core.config.settings import Config, DriveConfig
@@ -185,6 +185,7 @@ def _repeated(leg: Leg, words: str, prompt: Prompt, ride: Ride, drive: DriveConf
                 raise
             prompt.show_text(f"This leg has ended early: {error}")
             prompt.instruct("Put the robot back where and how the leg began. Then start it again.")
+            words = words.replace(STAY, "")
     raise AssertionError
 
 

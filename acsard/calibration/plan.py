@@ -26,6 +26,8 @@ METHODS = {
     "tape": "a tape measure and a straight line on the floor",
 }
 
+STAY = "Do not move the robot by hand until the calibration is done. "
+
 FLOOR_M, EDGE_M = 3.0, 0.1
 REACH = 0.75  # assumed distance from the middle to the outermost point / wheel separation
 SPEED, ROLLING_SPEED = 0.3, 0.5  # m/s straight ahead, and of the wheels in turns
@@ -179,9 +181,8 @@ def _sensor(setup: Setup, *, tape: bool) -> tuple[Leg, ...]:
     return (
         Leg(
             "straight",
-            f"{_place(setup)} Mark on the floor where one wheel stands. Do not move the robot by "
-            f"hand until the calibration is done. It stands, then drives {setup.length:.2f} m "
-            "straight ahead.",
+            f"{_place(setup)} Mark on the floor where one wheel stands. {STAY}It stands, then "
+            f"drives {setup.length:.2f} m straight ahead.",
             (PAUSE, setup.ahead(setup.length), PAUSE), (optional,) if tape else (),
         ),
         Leg(
@@ -212,8 +213,7 @@ def _tape(setup: Setup, track: float) -> tuple[Leg, ...]:
             f"{_place(setup)} Draw or find a straight line on the floor, about 300 mm to the left "
             "of the robot, along which the robot faces: its front left and its rear left wheel "
             "have the same distance from the line, to the millimetre. Mark where one wheel stands. "
-            "Do not move the robot by hand until the calibration is done. The robot drives "
-            f"{setup.length:.2f} m straight ahead.",
+            f"{STAY}The robot drives {setup.length:.2f} m straight ahead.",
             (setup.ahead(setup.length),), (FROM_MARK, *TO_LINE),
         ),
         Leg(

@@ -13,8 +13,8 @@ from msgspec import Struct
 from rich.console import RenderableType
 
 from acsard.calibration.checks import require_agreement, require_motion
-from acsard.calibration.fit import LEFT, RIGHT, TRACK, Errors, Fit, fit
-from acsard.calibration.log import Log, LogError
+from acsard.calibration.fit import AGREES, LEFT, RIGHT, TRACK, Errors, Fit, fit
+from acsard.calibration.log import Floats, Log, LogError, TapeReading
 from acsard.calibration.noise import Noise, noise
 from acsard.calibration.response import response_time
 from acsard.core.config.settings import Config
@@ -88,12 +88,18 @@ def _result(log: Log, config: Config, source: str, found: Fit, notes: list[str])
     stds = stds * configured * factors
     shown = noise(log.runs, found, config.odometry)
     settings: dict[str, float] = {}
-    decisions = [*_geometry(found, config, settings, shown), *_misread(found)]
+    decisions = [*_geometry(found, config, settings, shown)]
+    misread = _misread(found, [run.name for run in log.runs])
     decisions += _noise(found, config, settings, shown)
     decisions += _response(log, config, settings)
     if not settings:
-        agrees = "Your robot agrees with its configuration: nothing to write."
-        raise LogError("\n".join([agrees, *decisions]))
+        agrees = found.readings is None or found.readings.now <= AGREES
+        verdict = (
+            "Your robot agrees with its configuration" if agrees else "No value is surely better"
+        )
+        raise LogError("\n".join([misread or f"{verdict}: nothing to write.", *decisions]))
+    if misread:
+        decisions.append(misread)
     return Result(
         source, " and ".join(found.sensors), len(log.runs), sum(r.seconds for r in log.runs),
         sum(float(np.abs(d).sum()) for d, _ in motion),
@@ -148,22 +154,36 @@ def _geometry(
     )
 
 
-def _misread(found: Fit) -> Iterator[str]:
-    readings = [
-        (abs(float(missed)), reading, piece.run.name)
-        for piece in found.pieces if piece.run.tape
-        for missed, reading in zip(piece.residuals(found.p)["tape"], piece.run.tape, strict=True)
-    ]  # fmt: skip
-    if not readings:
-        return
-    missed, reading, name = max(readings, key=lambda row: row[0])
-    if missed > MISREAD:
-        off = missed * reading.std
-        size = f"{math.degrees(off):.0f} deg" if reading.quantity == "turn" else f"{off:.3f} m"
-        yield (
-            f"Your readings do not fit one track and size: the {reading.quantity} of run {name} is "
-            f"missed by {size}. Was the robot moved by hand, or a distance misread?"
-        )
+def _misread(found: Fit, runs: Sequence[str]) -> str:
+    # A sentence about readings that fit neither the configuration nor new values.
+    if found.readings is None:
+        return ""
+    alone = np.eye(len(found.pieces), dtype=bool)
+    worst = _worst(found, [found.p for _ in alone])
+    if worst[0] <= MISREAD:
+        if found.better or min(found.readings.now, found.readings.new) <= AGREES:
+            return ""
+        # The new values follow the wrong reading: compare it with what the others show.
+        worst = _worst(found, [found.without(piece) for piece in alone])
+    missed, reading, name = worst
+    off, turn = missed * reading.std, reading.quantity == "turn"
+    return (
+        f"The measurements do not fit together: measure again. The {reading.quantity} of run "
+        f"{runs.index(name) + 1} of {len(runs)} ({name}) is missed by "
+        f"{f'{math.degrees(off):.0f} deg' if turn else f'{1000 * off:.0f} mm'}. Was it misread, or "
+        f"the robot moved by hand{'' if turn else ', or is drive.wheel_radius wrong'}?"
+    )
+
+
+def _worst(found: Fit, parameters: Sequence[Floats]) -> tuple[float, TapeReading, str]:
+    # The deviations of the reading that is missed most, with the parameters for each piece.
+    return max(
+        (
+            (abs(float(missed)), reading, piece.run.name)
+            for piece, p in zip(found.pieces, parameters, strict=True) if piece.run.tape
+            for missed, reading in zip(piece.residuals(p)["tape"], piece.run.tape, strict=True)
+        ), key=lambda row: row[0],
+    )  # fmt: skip
 
 
 def _noise(found: Fit, config: Config, settings: dict[str, float], shown: Noise) -> Iterator[str]:

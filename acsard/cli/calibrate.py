@@ -186,6 +186,7 @@ def _written(
         print(f"\nthe values cannot be written: {error}", file=sys.stderr)
         return False
     if TerminalPrompt().ask(f"Write these values into {where}?", ("yes", "no")) == "no":
+        print("nothing was written")
         return False
     change(Path(where), dict(result.settings))
     print(f"{where}: written")

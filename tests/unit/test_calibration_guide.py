@@ -28,6 +28,7 @@ from acsard.terminal.prompt import NumberQuestion, Prompt
 
 STEP_S, LINE_M, WHEELBASE_M, WIDTH_M = 0.02, 0.45, 0.25, 0.30
 SETUP = Setup.of(Config())
+AGAIN = r"measure again\. The distance of run 1 of 4 \(ahead\) is missed by 1\d\d mm"
 REAL = "[mcu]\nport = '/dev/acsar_mcu'\n"
 
 
@@ -120,8 +121,30 @@ def test_a_turn_that_was_misread_is_named(misread: str) -> None:
         replace(run, tape=(replace(turn, value=turn.value + 0.6),)) if run.name == misread else run
         for run in log.runs
     ]
-    with pytest.raises(LogError, match=rf"the turn of run {misread} is missed by \d\d deg"):
+    named = rf"^The measurements .* The turn of run \d of 4 \({misread}\) is missed by \d\d deg"
+    with pytest.raises(LogError, match=named) as end:
         calibrate(Log(tuple(wrong), ()), Config(), "the drive")
+    assert "agrees" not in str(end.value)
+
+
+@pytest.mark.parametrize(
+    ("track", "millimetres", "words"),
+    [
+        (1.0, 0, "^Your robot agrees with its configuration: nothing"),
+        (1.01, 0, "^No value is surely better: nothing"),
+        (1.0, 1850, f"^The measurements do not fit together: {AGAIN}"),
+        (1.2, 1850, f"^The measurements do not fit together: {AGAIN}"),
+    ],
+)
+def test_a_robot_agrees_with_its_configuration_only_if_the_readings_do(
+    track: float, millimetres: float, words: str
+) -> None:
+    robot = Robot(track, radius=0.05)
+    robot.lies = {"distance": [millimetres] if millimetres else []}
+    log = guided("tape", SETUP, robot, robot.ride)
+    with pytest.raises(LogError, match=words) as end:
+        calibrate(log, Config(), "the drive")
+    assert ("agrees" in str(end.value)) is (track == 1.0 and not millimetres)
 
 
 @pytest.mark.parametrize("method", METHODS)
@@ -138,6 +161,7 @@ def test_whatever_disturbs_a_leg_it_is_repeated_until_nobody_seems_to_be_there(
     robot.disturbed = [error("a chair")] * MAX_REPEATS
     assert len(guided("tape", SETUP, robot, robot.ride).runs) == 4
     assert robot.said.count("This leg has ended early: a chair") == MAX_REPEATS
+    assert sum("Do not move the robot by hand" in text for text in robot.said) == 1
     robot = Robot(1.5)
     robot.disturbed = [error("a chair")] * (MAX_REPEATS + 1)
     with pytest.raises(error, match="a chair"):

@@ -133,6 +133,7 @@ def test_after_a_guided_drive_the_person_says_whether_its_result_is_written(
     assert driving() == 0
     out, err = capsys.readouterr()
     assert says in err
+    assert ("nothing was written" in out) is (answer == "no")
     changed = file.exists() and file.read_text() != text
     assert changed is ("acsard.toml: written" in out) is (says == "restart the daemon")
     assert len(questions) == (text == "# mine\n")
