@@ -449,7 +449,6 @@ class Robot:
         if self._sanity.warning is not None:
             events.append(self._sanity.warning)
         if not why:
-            self.session.count_recovery.learn(line)
             return True
         self.counters["line_implausible"] += 1
         events.append(

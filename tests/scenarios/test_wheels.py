@@ -8,7 +8,14 @@ from itertools import product
 import pytest
 
 from acsard.core.config.contradictions import MOST_ASKED_HZ
-from acsard.core.config.settings import Config, ControlConfig, McuConfig, SimConfig
+from acsard.core.config.settings import (
+    Config,
+    ControlConfig,
+    FeedbackConfig,
+    LimitsConfig,
+    McuConfig,
+    SimConfig,
+)
 from acsard.core.motion.sides import FAULT_RESPONSES
 from acsard.core.motion.wheels import (
     BLOCK_S,
@@ -71,6 +78,26 @@ def test_a_faulty_encoder_stops_the_robot_and_is_named(world: World, wheel: int,
     assert world.call("clear").success
     world.drive(0.5, seconds=1.0)
     assert world.state.mode == "driving"
+
+
+@pytest.mark.parametrize(("counts", "period", "limit"), [(20, 0.02, 22.0), (16, 0.01, 25.0)])
+@pytest.mark.parametrize("rolls_on", [False, True])
+def test_a_limit_below_one_count_of_an_encoder_hides_neither_the_way_nor_a_runaway(
+    counts: int, period: float, limit: float, rolls_on: bool
+) -> None:
+    limits = LimitsConfig(wheel_speed=20.0, linear_speed=1.0)
+    mcu = McuConfig(reply_period=period, baud_rate=250000)
+    feedback, sim = FeedbackConfig(wheel_speed=limit), SimConfig(encoder_counts=counts)
+    world = World(Config(mcu=mcu, sim=sim, feedback=feedback, limits=limits))
+    with world.mcu.free_running(period):
+        world.run(0.5)
+        world.drive(0.9, seconds=5.0)
+        true = world.mcu.vehicle.pose.x
+        assert world.state.x == pytest.approx(true, abs=0.1)
+        if rolls_on:
+            with world.mcu.pushed(0.4):
+                world.hold(0.0, seconds=5.0)
+            assert world.state.code == "wheel_runaway"
 
 
 @pytest.mark.parametrize(("configured", "real"), [(0, 20), (20, 20), (0, 3200)])

@@ -72,7 +72,6 @@ def test_without_configured_counts_no_line_has_whole_counts_and_coarse_lines_are
         assert first.steps == (math.inf,) * 4
         for speeds, _ in lines(counts):
             line = recovery.recover_counts(Feedback(AT, WheelSpeeds(*speeds), PERIOD), 0.0)
-            recovery.learn(line)
             assert line.counted is None
         assert recovery.counts(0) == (0,) * 4
         assert (recovery.coarse_lines > 1000) == coarse == bool(recovery.coarse_lines)
@@ -81,7 +80,7 @@ def test_without_configured_counts_no_line_has_whole_counts_and_coarse_lines_are
 def steps_after(speeds: list[float], steps: Steps | None = None) -> Steps:
     steps = steps or Steps()
     for speed in speeds:
-        steps.add(speed)
+        steps.add(speed, 39.0)
     return steps
 
 
@@ -99,6 +98,8 @@ def test_a_quantization_step_is_known_once_it_has_recurred_and_while_it_does() -
     steps = steps_after([0.0, 30.0] * BLOCK_STEPS)
     assert steps.size == 30.0
     assert steps_after(fine_speeds(3 * BLOCK_STEPS), steps).size < 0.5
+    # Larger changes than the coarsest encoder causes do not count.
+    assert steps_after([0.0, 40.0] * BLOCK_STEPS, steps).size < 0.5
 
 
 class WholeCounts:

@@ -15,7 +15,7 @@ from msgspec.structs import replace
 from acsard.core.link.codec import Motors
 from acsard.core.link.feedback import Feedback
 from acsard.core.link.whole_counts import MAX_DOUBT, WholeCounts
-from acsard.core.values import Rad
+from acsard.core.values import Rad, Seconds
 
 MIN_CHANGE = 0.0105  # rad/s; less may be rounding
 
@@ -31,6 +31,14 @@ MAX_STEP_RATIO = 3.0
 # Of a count. Over a longer time than this, a change of speed is an acceleration.
 COARSE_ANGLE, MAX_INTERVAL_S = math.tau / 200, 0.03
 
+# Of the coarsest expected encoder, rad, with the rounding of its speed.
+COARSEST_COUNT = 0.393
+
+# In the largest change that teaches, because a board may count for less than the line's time.
+LARGEST_STEP = 1.5 * COARSEST_COUNT
+
+MIN_COUNT_S = 0.004  # boards that are asked more often repeat their speeds
+
 UNKNOWN = (math.inf,) * 4
 
 
@@ -39,7 +47,8 @@ class Steps(Struct):
 
     One count in a period T changes the speed by 2 pi / (counts per turn x T): 31 rad/s at 20 counts
     and 100 Hz. It is learned from the speeds, so it is right even if the firmware filters them or
-    divides by its nominal period. It is inf before `FIRST_STEPS` steps.
+    divides by its nominal period. A change that not even the coarsest encoder causes teaches
+    nothing, so no lie excuses itself. It is inf before `FIRST_STEPS` steps.
     """
 
     size: float = math.inf
@@ -47,11 +56,13 @@ class Steps(Struct):
     largest: list[float] = field(default_factory=lambda: [0.0] * STEP_RANK)  # in this block
     count: int = 0
 
-    def add(self, speed: float) -> None:
+    def add(self, speed: float, limit: float) -> None:
         step = abs(speed - self.last)
         if step < MIN_CHANGE:
             return
         self.last = speed
+        if step > limit:
+            return
         largest = self.largest
         if step > largest[0]:
             largest[0] = step
@@ -75,6 +86,7 @@ class CountRecovery(Struct):
     wheels: tuple[Steps, Steps, Steps, Steps] = field(default_factory=_unknown)
     learned: Motors = UNKNOWN
     steps: Motors = UNKNOWN  # limited by `MAX_STEP_RATIO`
+    elapsed_s: Seconds = 0.0  # of the last line
     coarse_lines: int = 0  # with a coarse encoder and no configured counts
 
     def forget(self) -> None:
@@ -87,7 +99,7 @@ class CountRecovery(Struct):
         return (configured if self.whole.doubt < MAX_DOUBT else 0,) * 4
 
     def recover_counts(self, line: Feedback, angle: Rad, shown: bool = True) -> Feedback:
-        """Return a good line with `counted`, `steps` (by the lines before) and `count`.
+        """Return a good line with `counted`, `steps` and `count`.
 
         `angle` is that of one count, rad, or 0 if the counts are not configured; `shown`: the
         speeds show whole counts. If these include the motion of a missing line before it, `bridged`
@@ -104,18 +116,14 @@ class CountRecovery(Struct):
             # One count is a step of this size; none is learned.
             step = angle / elapsed_s if elapsed_s > 0.0 else 0.0
             return replace(line, counted=counted, steps=(step, step, step, step), count=angle)
-        return replace(line, steps=self.steps)
-
-    def learn(self, line: Feedback) -> None:
-        """Learn the steps of a line whose speeds are possible, unless the counts are configured."""
-        if line.count:
-            return
-        elapsed_s, speeds = line.dt - line.bridged, line.speeds.as_tuple()
+        # The counts of either line may cause the change.
+        limit = LARGEST_STEP / max(elapsed_s, self.elapsed_s, MIN_COUNT_S)
+        self.elapsed_s = elapsed_s
         a, b, c, d = self.wheels
-        a.add(speeds[0])
-        b.add(speeds[1])
-        c.add(speeds[2])
-        d.add(speeds[3])
+        a.add(speeds[0], limit)
+        b.add(speeds[1], limit)
+        c.add(speeds[2], limit)
+        d.add(speeds[3], limit)
         reported = a.size, b.size, c.size, d.size
         if reported != self.learned:
             most = MAX_STEP_RATIO * sorted(reported)[2]
@@ -123,3 +131,4 @@ class CountRecovery(Struct):
             self.steps = min(a.size, most), min(b.size, most), min(c.size, most), min(d.size, most)
         if elapsed_s < MAX_INTERVAL_S and COARSE_ANGLE < max(self.steps) * elapsed_s < math.inf:
             self.coarse_lines += 1
+        return replace(line, steps=self.steps)

@@ -17,6 +17,7 @@ from msgspec import Struct
 
 from acsard.core.link.codec import Motors
 from acsard.core.link.feedback import Feedback
+from acsard.core.link.quantization import COARSEST_COUNT, MIN_COUNT_S
 from acsard.core.values import WHEELS, Event, RadPerS, WheelSpeeds
 
 FAULT_LINES = 3  # in a row: 30 ms at 100 Hz
@@ -30,12 +31,6 @@ SPEED_MARGIN = 2.0  # rad/s beyond `MAX_WHEEL_ACCELERATION`, by coarse encoders
 MAX_WHEEL_ACCELERATION = 1500.0  # rad/s2, more than any real wheel's
 
 COUNT_MARGIN = 2  # each of two reports may be wrong by one
-
-# Of the coarsest expected encoder, rad. No learned step excuses more, and until the steps are
-# learned, a line with a speed over `feedback.wheel_speed` has this at most.
-COARSEST_COUNT = math.tau / 16
-
-MIN_COUNT_S = 0.004  # boards that are asked more often repeat their speeds
 
 # Least time between two lines: while this computer catches up, one count would look fast.
 MIN_INTERVAL_S = 0.004
@@ -151,6 +146,9 @@ class Sanity(Struct):
         usual = max(own, MIN_COUNT_S)
         # While other wheels rest, damaged lines of one wheel look like the steps of its encoder.
         learned = max(line.steps) < math.inf
+        # The pose fills the time of the impossible lines before this one with its speeds.
+        dropped_s = max(0.0, self.since - max(line.dt, line.since))
+        # Until the steps are learned, a line has one count of the coarsest encoder at most.
         # A line without a known time moves nothing, so no count in it is excused.
         most = max(fastest, COARSEST_COUNT / usual if own > 0.0 else 0.0)
         beyond, speeds = list(self.beyond), line.speeds.as_tuple()
@@ -160,7 +158,7 @@ class Sanity(Struct):
                 count = line.count
                 if now and turned[wheel]:
                     time = abs(turned[wheel]) / size  # in which the board has counted
-            over = beyond[wheel] = max(0.0, beyond[wheel] + (size - fastest) * time)
+            over = beyond[wheel] = max(0.0, beyond[wheel] + (size - fastest) * (time + dropped_s))
             if size > fastest and (over > count or not (learned or size <= most)):
                 return f"{WHEELS[wheel]} at {now:.2f} rad/s is over feedback.wheel_speed"
         a, b, c, d = beyond
