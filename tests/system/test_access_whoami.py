@@ -50,7 +50,7 @@ def test_a_local_client_without_a_certificate_is_a_maintainer(robot: Gated) -> N
 def test_doctor_prints_the_role_the_certificate_and_its_permissions(robot: Gated) -> None:
     output = robot.tool("viewer", "doctor").out
     assert f"role: your certificate viewer has the role viewer: {VIEWER_MAY}" in output
-    assert re.search(r"; your sender id is \S+/\d+/", output)
+    assert re.search(r"; your sender id is \S+@\S+ acsard doctor/[0-9a-f]{16}", output)
 
 
 @pytest.mark.slow
