@@ -78,7 +78,7 @@ def test_home_answers_a_question_within_two_clicks(question: str) -> None:
 def test_the_page_of_the_counters_has_each_name_that_the_product_counts() -> None:
     page = text_of("deploy/manual/pages/reference/counters.md")
     product = "".join(path.read_text() for path in (ROOT / "acsard").rglob("*.py"))
-    names = set(re.findall(r'counters\["(\w+)"\]', product))
+    names = set(re.findall(r'(?:counters\[|state\.count\()"(\w+)"', product))
     groups = tuple(re.findall(r"`(\w+_)<reason>`", page))
     assert len(names) > 15
     assert not {n for n in names if not n.startswith(groups) and f"`{n}`" not in page}

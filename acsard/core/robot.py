@@ -9,39 +9,30 @@ writes the port, and `core/guard.py` checks each line.
 from __future__ import annotations
 
 import math
-from collections import Counter
 from collections.abc import Sequence
 from typing import assert_never, cast
 
 from msgspec.structs import replace
 
-from acsard.core.board_inputs import inputs_after
 from acsard.core.codes import Reason, RefusalCode, reason
 from acsard.core.config.live import Changes, changed, describe_changes
 from acsard.core.config.parsing import ConfigError
 from acsard.core.config.settings import Config, LimitsConfig
 from acsard.core.link.board_status import as_text
 from acsard.core.link.feedback import Feedback
-from acsard.core.link.link_diagnosis import UnansweredLines
 from acsard.core.link.link_setup import LinkSetup
 from acsard.core.link.link_state import WATCHDOG_S
-from acsard.core.link.session import QUESTION_LINE, McuSession
-from acsard.core.motion.arbiter import Arbiter, Choice
-from acsard.core.motion.arbiter_text import CommandEvents, missed, refused, waiting
+from acsard.core.link.session import QUESTION_LINE
+from acsard.core.motion.arbiter_text import missed, refused, waiting
 from acsard.core.motion.battery import empty_reason
-from acsard.core.motion.consistency import ConsistencyChecks
 from acsard.core.motion.emergency_stop import DRIVER_FAULT_REASON
-from acsard.core.motion.event_throttle import EventThrottle
 from acsard.core.motion.kinematics import Kinematics
-from acsard.core.motion.last_line import LastLine
-from acsard.core.motion.lifecycle import Lifecycle
 from acsard.core.motion.limits import AT_REST, Motion
 from acsard.core.motion.modes import Mode, RefusedError
-from acsard.core.motion.odometry import Odometry
-from acsard.core.motion.sanity import Sanity
 from acsard.core.motion.uncertainty import ErrorModel
 from acsard.core.motion.wheels import LEAST_SPEED
 from acsard.core.reasons import reason_of
+from acsard.core.robot_state import State, initial
 from acsard.core.values import (
     NS_PER_S,
     REST,
@@ -94,92 +85,80 @@ NOTHING_CHANGED = "nothing changed: all settings already have these values"
 MAX_REFUSAL_LENGTH = 200  # characters in `state`: the text may quote the message of a client
 
 
+def error_model(config: Config) -> ErrorModel:
+    return ErrorModel(
+        config.odometry,
+        Kinematics(config.drive),
+        config.mcu.encoder_counts,
+        config.limits,
+        config.feedback,
+    )
+
+
 class Robot:
-    def __init__(self, config: Config, latches: Latches = Latches()) -> None:  # noqa: B008
-        # As after a start of the daemon; `latches` decides the first mode.
+    def __init__(
+        self,
+        config: Config,
+        latches: Latches = Latches(),  # noqa: B008
+        state: State | None = None,
+    ) -> None:
+        # As after a start of the daemon with `latches`, or as a recording says in `state`.
         self.config = config  # in force; a `set` replaces it
         self.link_setup = LinkSetup.of(config.mcu, config.rate_hz, config.feedback)
-        self.session = McuSession()
-        self._kinematics = Kinematics(config.drive)
-        self._errors = self._error_model()
-        self._odometry = Odometry.initial(self._errors)
-        self._checks = ConsistencyChecks()
-        self._arbiter = Arbiter()
-        self._cap = SpeedCap(None)
-        self._life = Lifecycle(latches)
-        self._announced: tuple[Event, ...] = ()  # for the next `hear`
-        if latches.causes:
-            kind, why = f"start -> {self._life.mode}", self._life.why
-            first = Event("mode", why.text, "warning", kind=kind, code=why.code)
-            self._announced = (first,)
-        self._choice = Choice()
-        self._last = LastLine(made_of=(None, self._life.mode))
+        self.model = error_model(config)
+        self.state = state or initial(latches, config, self.model)
         # Motion, twist, limits and cap with which the motion does not change; its wheel speeds.
         self._steady: tuple[tuple[Motion, Twist, LimitsConfig, float] | None, WheelSpeeds]
         self._steady = (None, STILL)
-        self.status = Status("", "booting", "", "down")
-        # Since the start: `commands` (accepted), `command_<reason>` (refused),
-        # `commands_of_new_senders` (not proved yet), lines to the board, and events.
-        self.counters: Counter[str] = Counter()
-        self._refused: tuple[str, Ns] | None = None  # the last command, and when
-        self._sanity = Sanity()
-        self._inputs = inputs_after(latches, config)
-        self._answered = UnansweredLines()
-        self._tally = EventThrottle()
-        # Verb, client and arrival of the last request: a call of `srv/stop` arrives as two, and the
-        # second, which leads to the reply, is not logged.
-        self._asked: tuple[str, str, int | None] = ("", "", None)
-        self._told = CommandEvents(self._life.mode)
-        self._linked_once = False
         # The result of the last `hear` holds until then if only bytes arrive; 0: not even now.
         self._until_ns: Ns = 0
         self._silence = Heard(True)  # what `hear` gets if nothing arrives
         self._is_watched = True  # the reports of the board may change the mode at any time
-        self._arbiter.require_neutral()
 
     def snapshot(self, now_ns: Ns) -> Snapshot:
         """Return what `state` and `diagnostics` need; too slow for every wake-up."""
-        session, silent = self.session, self.session.silent(now_ns)
-        refused, since_ns = self._refused or ("", None)
-        counters = {"lines": session.good_lines} | self._odometry.counters()
+        state = self.state
+        session, silent = state.session, state.session.silent(now_ns)
+        refused, since_ns = state.refused or ("", None)
+        counters = {"lines": session.good_lines} | state.odometry.counters()
         counters |= {f"line_{reason}": count for reason, count in session.rejects.items() if count}
         if session.count_recovery.coarse_lines:
             counters["coarse_encoder_lines"] = session.count_recovery.coarse_lines
-        checks = self._checks
-        life = self._life
+        checks = state.checks
+        life = state.life
         ages = {number: (now_ns - at_ns) / NS_PER_S for number, at_ns in life.shown.items()}
         return Snapshot(
-            status=self.status,
+            status=state.status,
             causes=life.latches.causes,
             cause_ages=ages,
             applied=self.applied,
-            pose=self._odometry.pose,
-            measured=None if silent else self._odometry.twist,
-            speeds=None if silent else self._odometry.speeds,
-            sources=self._arbiter.status(now_ns, self.config.commands),
-            counters=counters | self.counters,
+            pose=state.odometry.pose,
+            measured=None if silent else state.odometry.twist,
+            speeds=None if silent else state.odometry.speeds,
+            sources=state.arbiter.status(now_ns, self.config.commands),
+            counters=counters | state.counters,
             refused=refused,
             refused_age_s=None if since_ns is None else (now_ns - since_ns) / NS_PER_S,
             feedback_age_s=session.feedback_age_s(now_ns),
             gyro=checks.gyro_status(self.config.odometry),
             doubt=checks.wheels_status(self.config.feedback),
             check=session.check(self.link_setup),
-            unanswered=self._answered.told,
+            unanswered=state.unanswered.told,
             encoders=session.count_recovery.counts(self.config.mcu.encoder_counts),
             pose_doubt=session.doubt.code,
             port_released=life.port_released,
-            sender=self._choice.sender,
-            estop=self._inputs.estop.state,
-            bumpers=self._inputs.bumpers.pressed,
-            bumper=self._inputs.bumpers.why(self.config.safety),
-            battery=self._inputs.battery.status,
+            sender=state.choice.sender,
+            estop=state.inputs.estop.state,
+            bumpers=state.inputs.bumpers.pressed,
+            bumper=state.inputs.bumpers.why(self.config.safety),
+            battery=state.inputs.battery.status,
             board=self._board(now_ns),
             speed_limit=self._cap_text,
         )
 
     def waits(self, now_ns: Ns) -> dict[str, Reason]:
         """Return what each source that sends, but does not drive, waits for."""
-        sources = self._arbiter.status(now_ns, self.config.commands)
+        sources = self.state.arbiter.status(now_ns, self.config.commands)
         return {
             source.name: waiting(source.waits_for)
             for source in sources
@@ -187,52 +166,58 @@ class Robot:
         }
 
     @property
+    def status(self) -> Status:
+        """The mode, and why the robot moves or does not move."""
+        return self.state.status
+
+    @property
     def latches(self) -> Latches:
         """The latches in force, even after an exception in a step."""
-        return self._life.latches
+        return self.state.life.latches
 
     @property
     def port_released(self) -> bool:
         """Whether another program may use the serial port."""
-        return self._life.port_released
+        return self.state.life.port_released
 
     @property
     def applied(self) -> Twist:
         """The twist in the line of `drive`, after all limits; after `sent`, in the last one."""
-        return self._last.applied
+        return self.state.last.applied
 
     @property
     def speeds(self) -> WheelSpeeds:
         """The wheel speeds in the last line of `drive`; zero after a press and without a link."""
-        return self._last.speeds
+        return self.state.last.speeds
 
     @property
     def command_ns(self) -> Ns | None:
         """Arrival of the command that the robot follows."""
-        return self._choice.arrived_ns
+        return self.state.choice.arrived_ns
 
     @property
     def travelled(self) -> float:
         """Distance driven since the daemon started, m, forwards plus backwards, by odometry."""
-        return self._odometry.travelled
+        return self.state.odometry.travelled
 
     def hear(self, now: Instant, heard: Heard) -> News:
         """Process what arrived since the last call, and return what is to be published."""
-        now_ns, life, arbiter, session = now.mono_ns, self._life, self._arbiter, self.session
+        state = self.state
+        now_ns, life, arbiter, session = now.mono_ns, state.life, state.arbiter, state.session
         steady = now_ns - arbiter.begun_ns < STEADY_STEP_NS
         holds = steady and now_ns < self._until_ns
         if holds and heard == self._silence:
             arbiter.begun_ns = session.lateness.looked_ns = now_ns
             return QUIET
         events: list[Event] = []
-        if heard.events or self._announced:
-            events += heard.events + self._announced
-            self._announced = ()
+        if heard.events or state.announced:
+            events += heard.events + state.announced
+            state.announced = ()
         arbiter.begin(now_ns, self.config.commands)
         if life.unshown:
             life.begin(now_ns)
         if heard.missed:
-            self.counters["missed_periods"] += heard.missed
+            state.count("missed_periods", heard.missed)
             events.append(missed(heard.missed, self.config.period_ns))
         estimates = self._fold(now, heard, events)
         # Nothing below has anything to do if `_fold` only integrated lines. It makes an event for
@@ -245,7 +230,7 @@ class Robot:
             self._until_ns = until_ns
             return News(estimates) if estimates else QUIET
         answers: tuple[Answer, ...] = ()
-        if heard.requests or self._last.trip or heard.shutting_down:
+        if heard.requests or state.last.trip or heard.shutting_down:
             answers = self._serve(now, heard, events)
         if heard.speed_cap is not None:
             self._cap_speed(heard.speed_cap, events)
@@ -256,18 +241,18 @@ class Robot:
         is_chosen = now_ns >= arbiter.until_ns
         if is_chosen:
             self._choose(now_ns)
-        mode, status, changed = life.mode, self.status, False
-        urgent = (self._choice.arrived_ns, mode) != self._last.made_of
+        mode, status, changed = life.mode, state.status, False
+        urgent = (state.choice.arrived_ns, mode) != state.last.made_of
         if is_chosen or events or answers or mode._value_ != status.mode or mode not in UNLATCHED:
             self._restate(heard.port_trouble)
-            changed = self.status is not status
+            changed = state.status is not status
         if changed or urgent:
-            why = Reason(self.status.code, self.status.reason)
-            events += self._told.changes(mode, self._choice, why)
+            why = Reason(state.status.code, state.status.reason)
+            events += state.command_events.changes(mode, state.choice, why)
         logged: tuple[Event, ...] = ()
-        if events or self._tally.held:
-            logged = self._tally.lines(events, now_ns)
-        waits = urgent or self._tally.held or life.unshown or self._is_watched or not steady
+        if events or state.throttle.held:
+            logged = state.throttle.lines(events, now_ns)
+        waits = urgent or state.throttle.held or life.unshown or self._is_watched or not steady
         self._until_ns = 0
         if not waits and mode in UNLATCHED:
             self._until_ns = min(arbiter.until_ns, session.until_ns)
@@ -281,32 +266,33 @@ class Robot:
         None: no line is due, because the board does not answer. Call `hear` before, and `sent`
         after each line.
         """
-        now_ns, twist, limits = now.mono_ns, self._choice.twist, self.config.limits
-        last, mode = self._last, self._life.mode
-        last.made_of, last.made_ns = (self._choice.arrived_ns, mode), now_ns
+        state = self.state
+        now_ns, twist, limits = now.mono_ns, state.choice.twist, self.config.limits
+        last, mode = state.last, state.life.mode
+        last.made_of, last.made_ns = (state.choice.arrived_ns, mode), now_ns
         since = (now_ns - last.left_ns) / NS_PER_S
         pressed = last.left_ns < last.pressed_ns
-        if pressed or self.session.link != "up" or since > WRITE_PAUSE_S:
+        if pressed or state.session.link != "up" or since > WRITE_PAUSE_S:
             # The first written line after a press contains zeros, even if the input is already
             # released and the commands that arrived meanwhile may move the robot.
             motion, speeds = AT_REST, STILL
         elif mode is Mode.DRIVING and twist is not None:
-            cap = math.inf if self._cap.speed is None else self._cap.speed
+            cap = math.inf if state.cap.speed is None else state.cap.speed
             wanted = (last.motion, twist, limits, cap)
             steady, speeds = self._steady
             if wanted == steady:
                 motion = last.motion
             else:
                 dt = min(since, max(MAX_DT, 1.5 / self.config.rate_hz))
-                motion = last.motion.follow(twist, dt, limits, self._kinematics, cap)
-                speeds = self._kinematics.wheel_speeds(motion.twist)
+                motion = last.motion.follow(twist, dt, limits, self.model.kinematics, cap)
+                speeds = self.model.kinematics.wheel_speeds(motion.twist)
                 if motion is last.motion:
                     self._steady = (wanted, speeds)
         else:
             motion = last.motion.coast(since, limits, stop=mode in HALTED)
-            speeds = self._kinematics.wheel_speeds(motion.twist)
+            speeds = self.model.kinematics.wheel_speeds(motion.twist)
         last.speeds, last.applied = speeds, motion.twist
-        line = self.session.line(self.link_setup, now_ns, speeds)
+        line = state.session.line(self.link_setup, now_ns, speeds)
         if line is not None:
             last.waiting = (motion, speeds)
         return line
@@ -316,29 +302,32 @@ class Robot:
 
         `trip` says why the guard replaced it with the stop line.
         """
+        state = self.state
         left = line is not None
         if trip or not left:
             self._until_ns = 0
         # The question moves nothing: a ramp continues from the line before it.
-        self._last.sent(left and line != QUESTION_LINE, trip)
+        state.last.sent(left and line != QUESTION_LINE, trip)
         # The board must not be expected to answer a line that the guard has replaced.
-        self.session.sent(self.link_setup, left_ns, was_written=left and not trip)
+        state.session.sent(self.link_setup, left_ns, was_written=left and not trip)
         if left:
-            self.counters["lines_sent"] += 1
-        elif self.session.link != "down":
-            self.counters["lines_superseded"] += 1
+            state.count("lines_sent")
+        elif state.session.link != "down":
+            state.count("lines_superseded")
 
     # Feedback.
 
     def _fold(self, now: Instant, heard: Heard, events: list[Event]) -> tuple[Estimate, ...]:
-        session, before = self.session, self.status.link
+        state = self.state
+        session, before = state.session, state.status.link
         feedback = session.update(
             self.link_setup, now, heard.port_open, heard.opened, heard.received
         )
-        link, inputs = session.link, self._inputs
-        if (feedback and self.counters["lines_sent"] >= self._answered.due) or link != "up":
-            warning = self._answered.check(
-                self.counters["lines_sent"],
+        link, inputs = session.link, state.inputs
+        sent = state.counters.get("lines_sent", 0)
+        if (feedback and sent >= state.unanswered.due) or link != "up":
+            warning = state.unanswered.check(
+                sent,
                 session.good_lines,
                 link == "up",
                 self.config.mcu.reply_period,
@@ -346,16 +335,16 @@ class Robot:
             if warning is not None:
                 events.append(warning)
         if link != "up":
-            if before == "up" and not self._life.port_released:
-                self.counters["link_lost"] += 1
+            if before == "up" and not state.life.port_released:
+                state.count("link_lost")
                 if session.lateness.late_s:
-                    self.counters["link_lost_host_stall"] += 1
-            self._sanity.forget()
-            self._checks.wheels.pause()
+                    state.count("link_lost_host_stall")
+            state.sanity.forget()
+            state.checks.wheels.pause()
         if session.restarted:
             # No sender drives before the link is up for the first time, so accept a zero that was
             # sent during the start.
-            self._arbiter.require_neutral(now.mono_ns if self._linked_once else 0)
+            state.arbiter.require_neutral(now.mono_ns if state.linked_once else 0)
         if session.events:
             events += session.events
         if session.reopened:
@@ -368,16 +357,16 @@ class Robot:
         if link != "up":
             # Without a link the daemon cannot ramp, so set the speeds to zero at once. When the
             # link returns, a command from before the loss is too old to follow.
-            self._last.cut()
-            self._life.link(up=False)
+            state.last.cut()
+            state.life.link(up=False)
             if link == "down" and before != "down":
-                self._arbiter.require_neutral(now.mono_ns)
+                state.arbiter.require_neutral(now.mono_ns)
         elif before != "up" or is_watched or safety.bumpers or safety.estop == "required":
             # Nothing else changes whether an input is missing.
-            self._linked_once = True
-            self._life.link(up=not inputs.missing(safety))
-        if heard.gyro and self._errors.claims is not None:
-            self._checks.gyro.add_samples(heard.gyro)
+            state.linked_once = True
+            state.life.link(up=not inputs.missing(safety))
+        if heard.gyro and self.model.claims is not None:
+            state.checks.gyro.add_samples(heard.gyro)
         if not feedback:
             return ()
         estimates: list[Estimate] = []
@@ -387,130 +376,139 @@ class Robot:
         return tuple(estimates)
 
     def _watch_inputs(self, now: Instant, events: list[Event]) -> None:
+        state = self.state
         # A press stops the robot even if it began and ended between two wake-ups.
-        inputs, life, config, now_ns = self._inputs, self._life, self.config, now.mono_ns
+        inputs, life, config, now_ns = state.inputs, state.life, self.config, now.mono_ns
         estop, bumpers = inputs.estop, inputs.bumpers
-        changes = inputs.process_reports(self.session, now_ns, config)
-        if changes or self.session.status.new:
-            self._arbiter.until_ns = 0  # bumpers limit the choice
+        changes = inputs.process_reports(state.session, now_ns, config)
+        if changes or state.session.status.new:
+            state.arbiter.until_ns = 0  # bumpers limit the choice
         events += changes
         if estop.pressed_now is not None:
-            self.counters["emergency_stops"] += 1
+            state.count("emergency_stops")
             life.press(estop.pressed_now, now)
         if bumpers.pressed_now is not None:
-            self.counters["bumper_presses"] += 1
+            state.count("bumper_presses")
             if bumpers.latching(config.safety):
                 life.press(bumpers.pressed_now, now)
             else:
-                self._arbiter.require_neutral(now_ns)
+                state.arbiter.require_neutral(now_ns)
         if estop.pressed_now is not None or bumpers.pressed_now is not None:
             # Do not ramp: the hardware has cut the motors, or the robot touches an obstacle.
-            self._last.press(now_ns)
+            state.last.press(now_ns)
         if estop.driver_fault:
             self._fault(DRIVER_FAULT_REASON, now, events)
             life.freed_ns = now_ns
         if inputs.battery.stopped_now:
             life.press(empty_reason(config.battery), now)
-        if self.session.status.forgot:
+        if state.session.status.forgot:
             inputs.forget(config)
-        if inputs.battery.level != self.status.battery:
-            self._arbiter.until_ns = 0  # to state it
-        life.hold(inputs.clear_refusal(self.session, config), now_ns)
+        if inputs.battery.level != state.status.battery:
+            state.arbiter.until_ns = 0  # to state it
+        life.hold(inputs.clear_refusal(state.session, config), now_ns)
 
     def _choose(self, now_ns: Ns) -> None:
-        self._choice = self._arbiter.choose(now_ns, self.config.commands)
-        if self._inputs.bumpers.limiting(self.config.safety):
+        state = self.state
+        state.choice = state.arbiter.choose(now_ns, self.config.commands)
+        if state.inputs.bumpers.limiting(self.config.safety):
             self._limit_by_bumpers(now_ns)
-        self._life.command(self._choice.twist is not None)
+        state.life.command(state.choice.twist is not None)
 
     def _limit_by_bumpers(self, now_ns: Ns) -> None:
+        state = self.state
         # If no motion remains, each sender must send a zero, or the robot would drive against the
         # obstacle as soon as the bumper is released.
-        twist = self._choice.twist
+        twist = state.choice.twist
         if twist is None:
             return
-        away = self._inputs.bumpers.away(twist, self.config.safety)
+        away = state.inputs.bumpers.away(twist, self.config.safety)
         if away is None:
-            self._arbiter.require_neutral(now_ns)
+            state.arbiter.require_neutral(now_ns)
             # `require_neutral` has discarded all commands, so the new choice has no twist.
-            self._choice = self._arbiter.choose(now_ns, self.config.commands)
+            state.choice = state.arbiter.choose(now_ns, self.config.commands)
         elif away != twist:
-            self._choice = replace(self._choice, twist=away)
+            state.choice = replace(state.choice, twist=away)
 
     def _board(self, now_ns: Ns) -> dict[str, str]:
-        status_ns = self.session.status.last_ns
+        state = self.state
+        status_ns = state.session.status.last_ns
         if status_ns is None:
             return {}
         age_s = (now_ns - status_ns) / NS_PER_S
-        return as_text(self.session.status.last) | {"age_s": f"{age_s:.1f}"}
+        return as_text(state.session.status.last) | {"age_s": f"{age_s:.1f}"}
 
     def _is_plausible(self, line: Feedback, now: Instant, events: list[Event]) -> bool:
-        why = self._sanity.impossible(line, self.config.feedback.wheel_speed)
-        if self._sanity.warning is not None:
-            events.append(self._sanity.warning)
+        state = self.state
+        why = state.sanity.impossible(line, self.config.feedback.wheel_speed)
+        if state.sanity.warning is not None:
+            events.append(state.sanity.warning)
         if not why:
             return True
-        self.counters["line_implausible"] += 1
+        state.count("line_implausible")
         events.append(
             Event("lines_rejected", why, "warning", kind="implausible", count=1, news=False)
         )
-        self._odometry.skipped.add(line)
-        if self._sanity.doubtful:
+        state.odometry.skipped.add(line)
+        if state.sanity.doubtful:
             self._fault(reason("impossible_speeds", cause=why), now, events)
         return False
 
     def _check_and_integrate(self, line: Feedback, now: Instant, events: list[Event]) -> Estimate:
-        checks = self._checks
+        state = self.state
+        checks = state.checks
         wheels = checks.wheels
         # While the emergency stop counts as pressed, the motors may have no power, so wheels that
         # do not follow the commanded speeds are not a sign of a fault.
-        estop = self._inputs.estop
+        estop = state.inputs.estop
         pressed = estop.is_pressed or estop.pressed_now is not None
-        wheels.commanded = None if pressed else self._last.written
-        wheels.late = self.session.lateness.step_s > WRITE_PAUSE_S
-        estimate = self._odometry.fold(line, checks, self._errors)
+        wheels.commanded = None if pressed else state.last.written
+        wheels.late = state.session.lateness.step_s > WRITE_PAUSE_S
+        estimate = state.odometry.fold(line, checks, self.model)
         if wheels.fault is not None:
             self._fault(wheels.fault, now, events)
         if wheels.pushed:
-            self.counters["uncommanded_motion"] += 1
+            state.count("uncommanded_motion")
             events.append(Event("uncommanded_motion", wheels.pushed, "warning"))
         if wheels.events:
-            self.counters["wheel_faults"] += len(wheels.events)
+            state.count("wheel_faults", len(wheels.events))
         events += checks.events
         return estimate
 
     # Requests.
 
     def _serve(self, now: Instant, heard: Heard, events: list[Event]) -> tuple[Answer, ...]:
-        trip, self._last.trip = self._last.trip, ""
+        state = self.state
+        trip, state.last.trip = state.last.trip, ""
         if trip:
             self._fault(reason(trip), now, events)
-            self._life.freed_ns = now.mono_ns
-        if heard.shutting_down and self._life.mode is not Mode.SHUTDOWN:
-            self._life.leave()
+            state.life.freed_ns = now.mono_ns
+        if heard.shutting_down and state.life.mode is not Mode.SHUTDOWN:
+            state.life.leave()
         answers: tuple[Answer, ...] = ()
         for request in heard.requests:
             answers += (self._answer(request, now, events),)
         return answers
 
     def _answer(self, request: Request, now: Instant, events: list[Event]) -> Answer:
-        mode, changes = self._life.mode, Changes()
+        state = self.state
+        mode, changes = state.life.mode, Changes()
         try:
             message, numbers = self._execute(request, now, changes)
         except RefusedError as refusal:
             return Answer(request.id, False, str(refusal))
         asked = (request.verb, request.by, request.asked_ns)
-        if asked != self._asked or request.asked_ns is None:
-            news = self._life.mode is not mode or request.verb == "set"
+        if asked != state.request or request.asked_ns is None:
+            news = state.life.mode is not mode or request.verb == "set"
             events.append(Event(request.verb, message, by=request.by, news=news))
-        self._asked = asked
+        state.request = asked
         return Answer(request.id, True, message, numbers, changes)
 
     def _execute(
         self, request: Request, now: Instant, changes: Changes
     ) -> tuple[str, tuple[int, ...]]:
+        state = self.state
         # Return the message and the numbers of the causes that were latched or released.
-        life = self._life
+        life = state.life
         asked_ns = now.mono_ns if request.asked_ns is None else request.asked_ns
         match request.verb:
             case "stop":
@@ -519,19 +517,19 @@ class Robot:
             case "clear":
                 message, numbers = life.clear(request.numbers, asked_ns)
                 if numbers:
-                    self._sanity.forget()
-                    self._checks.wheels.forget()
+                    state.sanity.forget()
+                    state.checks.wheels.forget()
                     if not life.latches.of("stop"):
-                        self._inputs.estop.powered()
-                    self._arbiter.require_neutral(asked_ns)
+                        state.inputs.estop.powered()
+                    state.arbiter.require_neutral(asked_ns)
                 return message, numbers
             case "activate":
                 if life.port_released:
                     life.port_released = False  # even if it is refused
-                    self._odometry.uncertainty.lose()
+                    state.odometry.uncertainty.lose()
                 numbers = life.activate(request.numbers, asked_ns)
-                self._arbiter.forget_clocks()
-                self._arbiter.require_neutral(asked_ns)
+                state.arbiter.forget_clocks()
+                state.arbiter.require_neutral(asked_ns)
                 return "active", numbers
             case "deactivate" if request.release_port:
                 return self._release_port(request.by, now)
@@ -547,43 +545,36 @@ class Robot:
                 assert_never(request.verb)
 
     def _release_port(self, by: str, now: Instant) -> tuple[str, tuple[int, ...]]:
+        state = self.state
         if self.config.mcu.simulated:
             raise RefusedError("the built-in simulator has no serial port")
         if not self._at_rest or self._rolls(now.mono_ns):
             raise RefusedError("the port is released only while the robot rests")
         numbers: tuple[int, ...] = ()
-        if self._life.mode not in (Mode.STOPPED, Mode.FAULT, Mode.INACTIVE):
-            self._life.deactivate(by, now)
-            numbers = (self._life.latches.last,)
-        self._life.port_released = True
-        self._checks.gyro.rest_s = 0.0
+        if state.life.mode not in (Mode.STOPPED, Mode.FAULT, Mode.INACTIVE):
+            state.life.deactivate(by, now)
+            numbers = (state.life.latches.last,)
+        state.life.port_released = True
+        state.checks.gyro.rest_s = 0.0
         return PORT_LENT, numbers
 
     @property
     def _at_rest(self) -> bool:
         # Two lines are zero: the last one that left, which the wheels follow, and the last one that
         # was computed.
-        return self.speeds == STILL and self._last.motion.twist == REST
+        return self.speeds == STILL and self.state.last.motion.twist == REST
 
     def _rolls(self, now_ns: Ns) -> bool:
+        state = self.state
         # The wheels may still turn after the line of zeros, or somebody pushes the robot.
-        speed = max(map(abs, self._odometry.speeds.as_tuple())) * self._kinematics.radius
-        return not self.session.silent(now_ns) and speed > LEAST_SPEED
-
-    def _error_model(self) -> ErrorModel:
-        config = self.config
-        return ErrorModel(
-            config.odometry,
-            self._kinematics,
-            config.mcu.encoder_counts,
-            config.limits,
-            config.feedback,
-        )
+        speed = max(map(abs, state.odometry.speeds.as_tuple())) * self.model.kinematics.radius
+        return not state.session.silent(now_ns) and speed > LEAST_SPEED
 
     def place(self, pose: Pose) -> str:
-        self._odometry.set_pose(pose, self._errors)
-        self._checks.gyro.forget_doubt()
-        pose = self._odometry.pose
+        state = self.state
+        state.odometry.set_pose(pose, self.model)
+        state.checks.gyro.forget_doubt()
+        pose = state.odometry.pose
         return f"pose is x {pose.x:g}, y {pose.y:g}, yaw {pose.yaw:g}"
 
     def _set(self, settings: dict[str, Plain], now_ns: Ns) -> Changes:
@@ -592,24 +583,26 @@ class Robot:
             self.config, changes = changed(before, settings, self._at_rest)
         except ConfigError as error:
             raise RefusedError(str(error)) from None
-        self._errors = self._error_model()
+        self.model = error_model(self.config)
         if self.config.commands != before.commands:
-            self._arbiter.require_neutral(now_ns)
+            self.state.arbiter.require_neutral(now_ns)
         return changes
 
     def _fault(self, why: Reason, now: Instant, events: list[Event]) -> None:
-        if self._life.fault(why, now):
-            self._arbiter.require_neutral(self._last.made_ns)
+        state = self.state
+        if state.life.fault(why, now):
+            state.arbiter.require_neutral(state.last.made_ns)
             text = f"{why.text}; `acsard call clear` releases it"
             events.append(Event("fault", text, "error", code=why.code))
 
     # Commands.
 
     def _accept_commands(self, now_ns: Ns, heard: Heard, events: list[Event]) -> None:
+        state = self.state
         messages: Sequence[Command | Refusal] = heard.commands
         senders = {(command.source, command.sender) for command in heard.commands}
         if superseded := len(heard.commands) - len(senders):
-            self.counters["commands_superseded"] += superseded
+            state.count("commands_superseded", superseded)
         if heard.refusals:
             # Process commands and refusals in the order of arrival. A message that is unreadable or
             # was lost may have commanded motion, so it cancels a zero that arrived before it.
@@ -617,33 +610,35 @@ class Robot:
         for message in messages:
             if isinstance(message, Refusal):
                 self._refuse(message, now_ns, events)
-                self._arbiter.notice(message.source, message.sender, message.arrived_ns)
+                state.arbiter.notice(message.source, message.sender, message.arrived_ns)
                 continue
             if message.stamp_replaced:
-                self.counters["stamps_replaced"] += 1
-            why = self._arbiter.accept(message, self.config.commands)
+                state.count("stamps_replaced")
+            why = state.arbiter.accept(message, self.config.commands)
             if why is not None:
                 text = f"source {message.source}: {waiting(why).text}"
                 code = cast("RefusalCode", why.what)
                 refusal = Refusal(code, text, message.source, message.sender)
                 self._refuse(refusal, now_ns, events)
             else:
-                self.counters["commands"] += 1
+                state.count("commands")
 
     def _refuse(self, refusal: Refusal, now_ns: Ns, events: list[Event]) -> None:
+        state = self.state
         events.append(refused(refusal))
         # Every sender that stamps its commands is unproven at first. This is normal, so `state`
         # must not show it as a refusal.
         if refusal.reason == "unproven":
-            self.counters["commands_of_new_senders"] += 1
+            state.count("commands_of_new_senders")
             return
-        self.counters[f"command_{refusal.reason}"] += 1
-        self._refused = (refusal.text[:MAX_REFUSAL_LENGTH], now_ns)
+        state.count(f"command_{refusal.reason}")
+        state.refused = (refusal.text[:MAX_REFUSAL_LENGTH], now_ns)
 
     # Limits and kinematics.
 
     def _cap_speed(self, cap: SpeedCap, events: list[Event]) -> None:
-        before, self._cap = self._cap, cap
+        state = self.state
+        before, state.cap = state.cap, cap
         if cap.speed == before.speed:
             return
         text = "the speed limit has ended" if cap.speed is None else f"{cap.speed:.3g} m/s"
@@ -651,7 +646,7 @@ class Robot:
 
     @property
     def _cap_text(self) -> str:
-        cap, highest = self._cap, self.config.limits.linear_speed
+        cap, highest = self.state.cap, self.config.limits.linear_speed
         if cap.speed is None or cap.speed >= highest:
             return ""
         return f"{cap.speed:.3g} m/s, set by {cap.by}; back to {highest:g} m/s when this limit ends"
@@ -659,11 +654,12 @@ class Robot:
     # Report.
 
     def _restate(self, port_trouble: str) -> None:
-        life, choice, session, inputs = self._life, self._choice, self.session, self._inputs
+        state = self.state
+        life, choice, session, inputs = state.life, state.choice, state.session, state.inputs
         why = reason_of(life, choice, session, self.link_setup, inputs, self.config, port_trouble)
         # Use `_value_`, because the property `value` of an enum runs Python code.
         mode, level = life.mode._value_, inputs.battery.level
         numbers = tuple([cause.number for cause in life.latches.causes])
         status = Status(mode, why.code, why.text, session.link, choice.source, level, numbers)
-        if status != self.status:
-            self.status = status
+        if status != state.status:
+            state.status = status

@@ -32,7 +32,7 @@ from acsard.recording.recorded_steps import (
     checksum,
     micropose,
 )
-from acsard.recording.state import LayoutError, State, StateError, short, thaw
+from acsard.recording.state import LayoutError, Restored, StateError, short, thaw
 
 NO_TRIP: Trip = ""
 
@@ -293,11 +293,11 @@ class Playback:
                 self._unread = Unread(head.version, head.mono_ns, head.mono_ns)
                 self._recording.damage.append(self._unread)
 
-    def _resume(self, state: State) -> None:
+    def _resume(self, restored: Restored) -> None:
         if self.replay is None:
-            self.replay = Replay(*state)
+            self.replay = Replay(*restored)
         else:
-            self.replay.resume(*state)
+            self.replay.resume(*restored)
 
     def _rests(self, step: RecordedStep) -> bool:
         # Whether the recorded robot rests; then a fresh one begins at its pose.
@@ -310,13 +310,13 @@ class Playback:
             return False
         robot, self._waits = Robot(config), None
         robot.place(Pose(*(part / US_PER_S for part in self._poses[1])))
-        self._resume(State(robot, Memory()))
+        self._resume(Restored(robot, Memory()))
         return True
 
-    def _robot_at(self, head: Head) -> State:
+    def _robot_at(self, head: Head) -> Restored:
         if head.state:
             return thaw(head.state, self._other)
-        return State(Robot(self._other or config_of(head)), Memory())
+        return Restored(Robot(self._other or config_of(head)), Memory())
 
     @contextmanager
     def errors(self) -> Iterator[None]:

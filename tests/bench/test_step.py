@@ -125,8 +125,8 @@ class Run:
         feed, step = made.port.feed, made.loop.step
         robot, self.heard = made.loop.robot, list[Received]()
         self.lines = Timed(robot._check_and_integrate)
-        self.parts = {"odometry": self.lines, "session": Timed(robot.session.update)}
-        self.parts["gyro"] = Timed(robot._checks.gyro.add_samples)
+        self.parts = {"odometry": self.lines, "session": Timed(robot.state.session.update)}
+        self.parts["gyro"] = Timed(robot.state.checks.gyro.add_samples)
         self.took = dict.fromkeys((*self.parts, "step", "simplest"), 0)
         simplest = Simplest()
 
@@ -176,7 +176,7 @@ def test_the_time_that_the_full_odometry_adds_to_a_step() -> None:
         rounds.append(times | {"added": added, "share": added / (times["step"] - added)})
     medians = {name: median(timing[name] for timing in rounds) for name in rounds[0]}
     assert run.world.state.gyro == "used"
-    assert run.world.loop.robot.session.count_recovery.counts(400) == (400,) * 4
+    assert run.world.loop.robot.state.session.count_recovery.counts(400) == (400,) * 4
     share = medians.pop("share")
     print("\nus a line: " + ", ".join(f"{name} {value:.1f}" for name, value in medians.items()))
     print(f"added is {share:.0%} of the rest of the step")

@@ -44,12 +44,12 @@ def test_a_replay_counts_lines_and_commands_as_the_daemon_did() -> None:
 
     world.port.offer = unplug  # type: ignore[method-assign]
     world.run(0.1)
-    counters = world.loop.robot.counters
+    counters = world.loop.robot.state.counters
     assert counters["lines_sent"] > 50
     # Five periods, one command between two of them, and the line in which the port was lost.
     assert counters["lines_superseded"] == 7
     assert counters["commands_superseded"] == 1
-    assert replayed(tape, PLAIN).robot.counters == counters
+    assert replayed(tape, PLAIN).robot.state.counters == counters
 
 
 def test_a_line_that_differs_is_reported_with_the_inputs_of_both_sides() -> None:

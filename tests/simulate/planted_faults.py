@@ -164,9 +164,9 @@ FAULTS = (
     fault("neutral gap", "a board that was silent for half a second asks each sender for a zero",
           SESSION, "LONG_GAP_NS = 1 * NS_PER_S", "LONG_GAP_NS = NS_PER_S // 2"),
     fault("neutral nothing", "a clear that finds nothing to release asks each sender for a zero",
-          ROBOT, "                if numbers:\n                    self._sanity.forget()\n",
-          "                self._arbiter.require_neutral(asked_ns)\n"
-          "                if numbers:\n                    self._sanity.forget()\n"),
+          ROBOT, "                if numbers:\n                    state.sanity.forget()\n",
+          "                state.arbiter.require_neutral(asked_ns)\n"
+          "                if numbers:\n                    state.sanity.forget()\n"),
     fault("neutral overtaken", "a speed that arrives behind a later zero moves the robot", AGES,
           "if not verdict and last.overtook(command, timeout_ns):", "if False:"),
     fault("ages echo", "a command with an echo counts however late it is", AGES,
@@ -255,14 +255,14 @@ FAULTS = (
           "for cause in latches.causes if cause.kind != kind]"),
     # robot
     fault("robot clear", "a clear asks no sender for a zero", ROBOT,
-          "                    self._arbiter.require_neutral(asked_ns)\n"
+          "                    state.arbiter.require_neutral(asked_ns)\n"
           "                return message, numbers\n", "                return message, numbers\n"),
     fault("robot set", "new timeouts ask no sender for a zero", ROBOT,
-          "            self._arbiter.require_neutral(now_ns)\n        return changes",
+          "            self.state.arbiter.require_neutral(now_ns)\n        return changes",
           "            pass\n        return changes"),
     fault("robot limits", "set answers, but the old limits stay in force", ROBOT,
-          "        now_ns, twist, limits = now.mono_ns, self._choice.twist, self.config.limits\n",
-          "        now_ns, twist, limits = now.mono_ns, self._choice.twist, self.config.limits\n"
+          "        now_ns, twist, limits = now.mono_ns, state.choice.twist, self.config.limits\n",
+          "        now_ns, twist, limits = now.mono_ns, state.choice.twist, self.config.limits\n"
           "        limits = self.__dict__.setdefault('_old_limits', limits)\n"),
     fault("robot reason", "a robot that stands says `no command`, whatever the cause is", REASONS,
           "why, limits = chosen(choice), config.limits",
@@ -279,7 +279,7 @@ FAULTS = (
           "core/link/line_times.py", "= sample_ns - before if before else 0, 0",
           "= 2 * (sample_ns - before) if before else 0, 0"),
     fault("session stale", "a robot whose board is silent gets zeros and says `driving`", ROBOT,
-          "self._life.link(up=False)", 'self._life.link(up=link == "stale")'),
+          "state.life.link(up=False)", 'state.life.link(up=link == "stale")'),
     fault("session gap", "a gap of the feedback asks no sender for a zero", SESSION,
           "before_ns >= LONG_GAP_NS:", "before_ns >= 1000 * LONG_GAP_NS:"),
     fault("session reopened", "a port that was opened again asks no sender for a zero", SESSION,
@@ -318,7 +318,7 @@ FAULTS = (
     fault("loop end", "SIGTERM ends the daemon while the robot moves", LOOP,
           "return self.robot.speeds == STILL", "return True"),
     fault("robot end", "the robot does not slow down on SIGTERM", ROBOT,
-          "            self._life.leave()\n", "            pass\n"),
+          "            state.life.leave()\n", "            pass\n"),
     fault("robot end reason", "`state` has no reason while the daemon ends", REASONS,
           "            return SHUTDOWN_REASON\n", '            return Reason("shutdown", "")\n'),
     fault("session mute", "a board that does not answer yet gets no lines", SESSION,
@@ -371,8 +371,8 @@ FAULTS = (
     fault("commands raise", "a command that is too big raises an exception", COMMANDS,
         'raise DecodeError("too_big", f"{len(arrival.payload)} bytes are too many for a command")',
         'raise ValueError("too big")'),
-    fault("bus counts", "commands of zero are not counted", ROBOT, 'self.counters["commands"] += 1',
-          'self.counters["commands"] += message.twist != REST'),
+    fault("bus counts", "commands of zero are not counted", ROBOT, 'state.count("commands")',
+          'state.count("commands", message.twist != REST)'),
     # odometry
     fault("odometry turn", "the pose turns the wrong way", KINEMATICS,
           "(right - left) / self.track", "(left - right) / self.track"),
@@ -390,9 +390,9 @@ FAULTS = (
     fault("odometry silent", "the pose goes on at 0.1 m/s while the board is silent", ROBOT,
           "        pressed = last.left_ns < last.pressed_ns\n",
           "        pressed = last.left_ns < last.pressed_ns\n"
-          '        if self.session.link != "up" and self.session.good_lines:\n'
-          "            pose = self._odometry.pose\n"
-          "            self._odometry.pose = replace(pose, x=pose.x + 0.001)\n"),
+          '        if state.session.link != "up" and state.session.good_lines:\n'
+          "            pose = state.odometry.pose\n"
+          "            state.odometry.pose = replace(pose, x=pose.x + 0.001)\n"),
     fault("odometry endless", "the covariance of a robot that has stood for 3 s is infinite",
           ODOMETRY, "        at_rest = self.rested > REST_S\n",
           "        at_rest = self.rested > REST_S\n" "        if self.rested > 3.0:\n"
@@ -437,10 +437,9 @@ FAULTS = (
           "        self.travelled += abs(distance)\n", "        self.travelled += abs(distance)\n"
           '        distance += __import__("time").perf_counter_ns() % 2 * 1e-9\n'),
     fault("replay state", "the state at the start of a recording has another heading",
-          "recording/state.py", "    return State(robot, frozen.memory)\n",
-          "    pose = robot._odometry.pose\n"
-          "    robot._odometry.pose = type(pose)(pose.x, pose.y, pose.yaw + 0.001)\n"
-          "    return State(robot, frozen.memory)\n"),
+          "recording/state.py", "        frozen = _frozen.decode(data)\n",
+          "        frozen = _frozen.decode(data)\n        pose = frozen.state.odometry.pose\n"
+          "        frozen.state.odometry.pose = type(pose)(pose.x, pose.y, pose.yaw + 0.001)\n"),
     # inputs of the board
     fault("driver ignored",
           "a fault of a motor driver that the board reports does not stop the robot", ROBOT,
@@ -451,7 +450,7 @@ FAULTS = (
           "        if session.status.last.driver_fault and self.estop.is_pressed:\n"),
     fault("driver without power", "a pressed emergency stop latches a fault of the motor drivers",
           ROBOT, "        if estop.driver_fault:\n",
-          "        if any(status.driver_fault for _, status in self.session.status.new):\n"),
+          "        if any(status.driver_fault for _, status in state.session.status.new):\n"),
     fault("driver release", "drivers that get their power later than the release latch a fault",
           EMERGENCY_STOP, "not (pressed or self.unpowered)", "not pressed"),
     fault("wheel press",
@@ -461,19 +460,20 @@ FAULTS = (
     fault("driver cut", "a fault of a motor driver stops the robot without a ramp", ROBOT,
         "            self._fault(DRIVER_FAULT_REASON, now, events)\n",
         "            self._fault(DRIVER_FAULT_REASON, now, events)\n"
-        "            self._last.cut()\n"),
+        "            state.last.cut()\n"),
     fault("estop ramp", "a robot whose emergency stop is pressed ramps down", ROBOT,
           "        if estop.pressed_now is not None or bumpers.pressed_now is not None:\n",
           "        if bumpers.pressed_now is not None:\n"),
     fault("estop latch", "a robot drives again as soon as its emergency stop is released", ROBOT,
           "            life.press(estop.pressed_now, now)\n",
-          "            self._arbiter.require_neutral(now_ns)\n"),
+          "            state.arbiter.require_neutral(now_ns)\n"),
     fault("estop short", "a press that begins and ends during a stall of the host is not seen",
           EMERGENCY_STOP, "        for at_ns, status in reports:\n",
           "        for at_ns, status in [*reports][-1:]:\n"),
     fault("estop late", "a pressed emergency stop waits up to 25 ms for its first zero", LOOP,
           "            if due:\n                line = robot.drive(now)\n",
-          "            late = robot._inputs.estop.is_pressed and now.mono_ns % 10**8 < 25 * 10**6\n"
+          "            pressed = robot.state.inputs.estop.is_pressed\n"
+          "            late = pressed and now.mono_ns % 10**8 < 25 * 10**6\n"
           "            due = due and not late\n"
           "            if due:\n                line = robot.drive(now)\n",
           Edit(LOOP, "None, news.urgent,", "None, news.urgent and not late,")),
@@ -484,11 +484,11 @@ FAULTS = (
     fault("estop hasty", "two lost status lines stop the robot", EMERGENCY_STOP,
           "SILENCE_TIMEOUT_S = 0.5", "SILENCE_TIMEOUT_S = 0.25"),
     fault("estop needed", "a robot is ready before its board has reported the inputs that it needs",
-          ROBOT, "            self._life.link(up=not inputs.missing(safety))\n",
-          "            self._life.link(up=True)\n"),
+          ROBOT, "            state.life.link(up=not inputs.missing(safety))\n",
+          "            state.life.link(up=True)\n"),
     fault("estop state", "`state` calls a pressed emergency stop released", ROBOT,
-          "            estop=self._inputs.estop.state,\n",
-          '            estop="released" if self._inputs.estop.state else "",\n'),
+          "            estop=state.inputs.estop.state,\n",
+          '            estop="released" if state.inputs.estop.state else "",\n'),
     fault("away towards", "a robot drives towards its pressed bumper", BUMPERS,
           '{"front": -1, "rear": 1, ', '{"front": 1, "rear": -1, '),
     fault("away fast", "a robot drives away from its bumper at 0.3 m/s", BUMPERS,
@@ -498,10 +498,10 @@ FAULTS = (
           "return Twist(direction * min(speed, AWAY_SPEED), twist.angular) if"),
     fault("away pushes",
           "a sender that pushes against the obstacle drives on at the release of the bumper", ROBOT,
-          "            self._arbiter.require_neutral(now_ns)\n            # `require_neutral` has "
-          "discarded all commands, so the new choice has no twist.\n            self._choice = "
-          "self._arbiter.choose(now_ns, self.config.commands)\n",
-          "            self._choice = Choice()\n"),
+          "            state.arbiter.require_neutral(now_ns)\n            # `require_neutral` has "
+          "discarded all commands, so the new choice has no twist.\n            state.choice = "
+          "state.arbiter.choose(now_ns, self.config.commands)\n",
+          "            state.choice = Choice()\n"),
     fault("away silent",
           "a robot that may drive away from its bumpers drives on without reports of them", BUMPERS,
           'return self.state == "silent" or not _drives_away(safety)',
@@ -516,7 +516,7 @@ FAULTS = (
     fault("battery cut", "an empty battery stops the robot without a ramp", ROBOT,
         "            life.press(empty_reason(config.battery), now)\n",
         "            life.press(empty_reason(config.battery), now)\n"
-        "            self._last.cut()\n"),
+        "            state.last.cut()\n"),
     fault("battery start", "the current of a motor start changes the level of the battery", BATTERY,
           "TIME_CONSTANT_S = 10.0\n", "TIME_CONSTANT_S = 0.5\n"),
     fault("battery clear", "a clear works while the battery is empty", INPUTS,
@@ -552,7 +552,7 @@ CASES = (
     fault("case 9", "healthy motors that lag latch the fault `runaway`", WHEELS_LAW,
           "elif approaches:", "elif False:"),
     fault("case 10", "`state` keeps the last speed when the link is gone", ROBOT,
-          "measured=None if silent else self._odometry.twist", "measured=self._odometry.twist"),
+          "measured=None if silent else state.odometry.twist", "measured=state.odometry.twist"),
     fault("case 11", "TX joined to RX looks like a board, and the daemon drives it",
           "core/link/echo_check.py", "            self.due = True\n        elif",
           "            pass\n        elif"),

@@ -9,7 +9,6 @@ import random
 import re
 from functools import cache
 from pathlib import Path
-from typing import Any
 
 import msgspec
 import pytest
@@ -19,13 +18,12 @@ from msgspec.structs import replace
 from acsard.core.config.settings import Config
 from acsard.core.guard import Memory
 from acsard.core.robot import Robot
+from acsard.core.robot_state import State
 from acsard.recording.file import Recording
 from acsard.recording.replay import Playback
 from acsard.recording.state import (
-    DERIVED,
     LAYOUT,
     MAX_BYTES,
-    PARTS,
     StateError,
     freeze,
     thaw,
@@ -58,11 +56,12 @@ def test_a_robot_is_read_back_unchanged(config: Config) -> None:
     robot, memory = world.loop.robot, world.loop._guard.memory
     assert memory.commanded_ns is not None
     data = freeze(robot, memory)
-    state = thaw(data)
-    assert state.memory == memory
-    assert state.robot.snapshot(world.now_ns) == robot.snapshot(world.now_ns)
-    assert freeze(*state) == freeze(*thaw(data, config)) == data
-    errors = [column for column in state.robot._odometry.uncertainty.columns if any(column)]
+    restored = thaw(data)
+    assert restored.memory == memory
+    assert restored.robot.state == robot.state
+    assert restored.robot.snapshot(world.now_ns) == robot.snapshot(world.now_ns)
+    assert freeze(*restored) == freeze(*thaw(data, config)) == data
+    errors = [column for column in robot.state.odometry.uncertainty.columns if any(column)]
     assert len(errors) >= 3 or config == PLAIN
 
 
@@ -105,31 +104,17 @@ def structs(kind: inspect.Type, found: set[type[Struct]]) -> set[type[Struct]]:
     return found
 
 
-@pytest.mark.parametrize("part", PARTS.values(), ids=PARTS)
-def test_a_part_that_is_plain_data_has_no_configuration_inside(part: Any) -> None:
-    modules = {cls.__module__ for cls in structs(inspect.type_info(part), set())}
+def test_no_field_of_a_state_contains_configuration() -> None:
+    modules = {cls.__module__ for cls in structs(inspect.type_info(State), set())}
     assert not [name for name in modules if name.startswith("acsard.core.config")]
 
 
-def test_each_attribute_of_a_robot_is_recorded_or_follows_from_the_configuration() -> None:
-    assert vars(Robot(PLAIN)).keys() == PARTS.keys() | {*DERIVED}
-
-
-@each(
-    ("part", "value"),
-    [("_tally", {"free_ns": {"stop": "soon"}}), ("_tally", 5), ("_tally", [{}, 0, {}])],
-)
-def test_a_part_with_a_value_of_another_type_is_refused(part: str, value: object) -> None:
+@each("value", [{"free_ns": {"stop": "soon"}}, 5, [{}, 0, {}]])
+def test_a_field_with_a_value_of_another_type_is_refused(value: object) -> None:
     frozen = msgspec.msgpack.decode(driven())
-    frozen["parts"][part] = value
+    frozen["state"]["throttle"] = value
     with pytest.raises(StateError, match="Expected"):
         thaw(msgspec.msgpack.encode(frozen))
-
-
-def test_what_a_part_of_an_older_version_lacks_has_its_default() -> None:
-    frozen = msgspec.msgpack.decode(driven())
-    assert frozen["parts"]["_tally"].pop("free_ns")
-    assert thaw(msgspec.msgpack.encode(frozen)).robot._tally.free_ns == {}
 
 
 def test_a_state_with_a_configuration_that_a_file_may_not_have_is_refused() -> None:

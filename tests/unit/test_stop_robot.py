@@ -117,7 +117,7 @@ def test_a_stop_that_comes_by_several_ways_is_one_event() -> None:
 def test_missed_periods_are_counted_and_reported() -> None:
     rig = Rig().linked()
     out = rig.step(missed=3)
-    assert rig.robot.counters["missed_periods"] == 3
+    assert rig.robot.state.counters["missed_periods"] == 3
     assert "missed_periods" in [event.name for event in out.events]
 
 

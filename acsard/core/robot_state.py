@@ -1,0 +1,70 @@
+"""All that a robot knows between two steps, as plain data.
+
+A recording stores it as it is, and with the inputs of the later steps it gives all later outputs.
+No field contains configuration: `Robot` has that beside it, and each method gets it as an argument.
+"""
+
+from __future__ import annotations
+
+from msgspec import Struct, field
+
+from acsard.core.board_inputs import BoardInputs, inputs_after
+from acsard.core.config.settings import Config
+from acsard.core.link.link_diagnosis import UnansweredLines
+from acsard.core.link.session import McuSession
+from acsard.core.motion.arbiter import Arbiter, Choice
+from acsard.core.motion.arbiter_text import CommandEvents
+from acsard.core.motion.consistency import ConsistencyChecks
+from acsard.core.motion.event_throttle import EventThrottle
+from acsard.core.motion.last_line import LastLine
+from acsard.core.motion.lifecycle import Lifecycle
+from acsard.core.motion.odometry import Odometry
+from acsard.core.motion.sanity import Sanity
+from acsard.core.motion.uncertainty import ErrorModel
+from acsard.core.values import Event, Latches, Ns, SpeedCap, Status
+
+
+class State(Struct):
+    life: Lifecycle
+    command_events: CommandEvents
+    last: LastLine
+    inputs: BoardInputs
+    odometry: Odometry
+    session: McuSession = field(default_factory=McuSession)
+    checks: ConsistencyChecks = field(default_factory=ConsistencyChecks)
+    sanity: Sanity = field(default_factory=Sanity)
+    unanswered: UnansweredLines = field(default_factory=UnansweredLines)
+    linked_once: bool = False  # the link was up since the start
+    arbiter: Arbiter = field(default_factory=Arbiter)
+    choice: Choice = Choice()
+    cap: SpeedCap = SpeedCap(None)
+    status: Status = Status("", "booting", "", "down")
+    # Since the start: `commands` (accepted), `command_<reason>` (refused),
+    # `commands_of_new_senders` (not proved yet), lines to the board, and events.
+    counters: dict[str, int] = {}
+    refused: tuple[str, Ns] | None = None  # the last command, and when
+    # Verb, client and arrival of the last request: a call of `srv/stop` arrives as two, and the
+    # second, which leads to the reply, is not logged.
+    request: tuple[str, str, Ns | None] = ("", "", None)
+    announced: tuple[Event, ...] = ()  # for the next `hear`
+    throttle: EventThrottle = field(default_factory=EventThrottle)
+
+    def count(self, name: str, more: int = 1) -> None:
+        self.counters[name] = self.counters.get(name, 0) + more
+
+
+def initial(latches: Latches, config: Config, model: ErrorModel) -> State:
+    """Return the state after a start of the daemon; `latches` decides the first mode."""
+    life = Lifecycle(latches)
+    state = State(
+        life,
+        CommandEvents(life.mode),
+        LastLine(made_of=(None, life.mode)),
+        inputs_after(latches, config),
+        Odometry.initial(model),
+    )
+    if latches.causes:
+        kind, why = f"start -> {life.mode}", life.why
+        state.announced = (Event("mode", why.text, "warning", kind=kind, code=why.code),)
+    state.arbiter.require_neutral()
+    return state
