@@ -193,7 +193,7 @@ class Robot:
     @property
     def command_ns(self) -> Ns | None:
         """Arrival of the command that the robot follows."""
-        return self.state.choice.arrived_ns
+        return self.state.arbiter.arrived_ns(self.state.choice)
 
     @property
     def travelled(self) -> float:
@@ -242,7 +242,7 @@ class Robot:
         if is_chosen:
             self._choose(now_ns)
         mode, status, changed = life.mode, state.status, False
-        urgent = (state.choice.arrived_ns, mode) != state.last.made_of
+        urgent = (state.choice.twist, mode) != state.last.made_of
         if is_chosen or events or answers or mode._value_ != status.mode or mode not in UNLATCHED:
             self._restate(heard.port_trouble)
             changed = state.status is not status
@@ -269,7 +269,7 @@ class Robot:
         state = self.state
         now_ns, twist, limits = now.mono_ns, state.choice.twist, self.config.limits
         last, mode = state.last, state.life.mode
-        last.made_of, last.made_ns = (state.choice.arrived_ns, mode), now_ns
+        last.made_of, last.made_ns = (state.choice.twist, mode), now_ns
         since = (now_ns - last.left_ns) / NS_PER_S
         pressed = last.left_ns < last.pressed_ns
         if pressed or state.session.link != "up" or since > WRITE_PAUSE_S:

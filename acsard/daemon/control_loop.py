@@ -108,7 +108,7 @@ class ControlLoop:
             if due:
                 line = robot.drive(now)
                 if line is not None:
-                    left = self._write(line, now)
+                    left = self._write(line, now, news.urgent)
         except Exception:
             # Store the stops that this wake-up has taken from the bus. The exception may have come
             # before the robot processed them.
@@ -158,7 +158,7 @@ class ControlLoop:
             self.shutting_down,
         )
 
-    def _write(self, line: bytes, now: Instant) -> Left:
+    def _write(self, line: bytes, now: Instant, urgent: bool) -> Left:
         # The guard may replace the line, and the port may drop it.
         robot, port, guard = self.robot, self._port, self._guard
         status, command_ns = robot.status, robot.command_ns
@@ -172,7 +172,7 @@ class ControlLoop:
             return None, trip, 0
         guard.record_written(line)
         if status.mode == "driving":
-            self.publication.stopwatch.line(command_ns, port.sent_ns, before_ns)
+            self.publication.stopwatch.line(command_ns, port.sent_ns, before_ns, urgent)
         late_ns = port.sent_ns - now.mono_ns
         late_ns = late_ns if late_ns >= MIN_WRITE_DELAY_NS else 0
         robot.sent(now.mono_ns + late_ns, line, trip)

@@ -146,6 +146,16 @@ def test_no_rate_of_commands_makes_more_lines_than_periods(world: World, hz: flo
     assert min(b - a for a, b in pairwise(lines)) >= GAP_NS
 
 
+@pytest.mark.parametrize("speed", [0.4, 0.0])
+def test_a_repeated_speed_has_no_line_of_its_own(world: World, speed: float) -> None:
+    world.drive(speed)
+    between_ticks(world, 0.0)
+    at_ns = world.now_ns
+    world.hold(speed, seconds=1.0, hz=19.0)
+    assert {late_ns % (10 * MS) for late_ns in sent_after(world, at_ns)} == {0}
+    assert world.state.mode == "driving"
+
+
 def test_a_stop_is_sent_between_periods_too(world: World) -> None:
     world.hold(0.5, seconds=1.0)
     between_ticks(world, 6.0)

@@ -210,14 +210,14 @@ def test_words(approved: Callable[[Path, str], None]) -> None:
         Wait("senders", senders=1),
     ]
     reasons = [waiting(wait) for wait in waits]
-    reasons += [chosen(Choice()), chosen(Choice("app", REST, Wait("nothing"), 1))]
+    reasons += [chosen(Choice()), chosen(Choice("app", REST, Wait("nothing")))]
     text = "".join(f"{why.code}: {why.text}\n" for why in reasons)
     text += "".join(f"missed: {missed(periods, 10 * MS).text}\n" for periods in (1, 3))
     approved(Path(__file__).with_name("words") / "who_drives.txt", text)
 
 
 def by(source: str, sender: str, wait: Wait = Wait("nothing")) -> Choice:  # noqa: B008
-    return Choice(source, REST, wait, 1, sender)
+    return Choice(source, REST, wait, sender)
 
 
 def said(events: CommandEvents, mode: Mode, choice: Choice) -> list[tuple[str, str]]:

@@ -39,7 +39,6 @@ class Choice(Struct, frozen=True):
     source: str = ""
     twist: Twist | None = None
     wait: Wait = COMMAND
-    arrived_ns: Ns | None = None
     sender: str = ""
 
 
@@ -122,7 +121,7 @@ class Arbiter(Struct):
 
     def accept(self, command: Command, commands: CommandsConfig) -> Wait | None:
         """Process a command. Return None if it is accepted, otherwise why it is refused."""
-        self.until_ns = 0
+        until_ns, self.until_ns = self.until_ns, 0
         for settings in commands.sources:
             if settings.name == command.source:
                 break
@@ -157,12 +156,26 @@ class Arbiter(Struct):
             why = _refusal(verdict, command, source.ages, sender.order, settings)
             sender.refuse(command, why)
             return why
+        if (
+            (command.source, command.sender) == self.holder
+            and sender.repeats(command, timeout)
+            and not command.shared
+            and sender.hint is None
+        ):
+            # Only the time of the sender that drives is newer, so the choice holds even longer.
+            self.until_ns = until_ns
         sender.take(command, timeout)
         if sender.hint is not None:
             _accept_hint(sender, command, source.ages, timeout)
         if neutral:
             sender.neutral(now_ns, zero)
         return None
+
+    def arrived_ns(self, choice: Choice) -> Ns | None:
+        """Return the arrival of the newest command of the sender that drives, None without one."""
+        if choice.twist is None:
+            return None
+        return self.sources[choice.source].senders[choice.sender].arrived_ns
 
     def notice(self, source: str, sender: str, arrived_ns: Ns) -> None:
         """Record that a message of a sender was lost or unusable; it may have been a speed.
@@ -212,12 +225,12 @@ class Arbiter(Struct):
         armed = sender.is_armed(now_ns)
         self.holder = settings.name, name if armed else ""
         if not (armed and sender.is_live(now_ns, timeout_ns(settings))):
-            return Choice(settings.name, None, _wait(sender, settings, now_ns, True), None, name)
+            return Choice(settings.name, None, _wait(sender, settings, now_ns, True), name)
         wait, since_ns = NOTHING, sender.zeros_ns
         if since_ns is not None and now_ns - since_ns >= LASTING_NS:
             kept = self._without_effect(now_ns, commands)
             wait = Wait("zeros", settings.name, kept=kept)
-        return Choice(settings.name, sender.twist, wait, sender.arrived_ns, name)
+        return Choice(settings.name, sender.twist, wait, name)
 
     def _refused(self, settings: Source, now_ns: Ns) -> Wait | None:
         # Why the newest command of a source that is not live was refused.

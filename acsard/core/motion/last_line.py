@@ -20,8 +20,8 @@ class LastLine(Struct):
     speeds: WheelSpeeds = STILL  # of the last line; zero after a press and without a link
     applied: Twist = REST  # after `sent`, in the last line that left
     made_ns: Ns = 0  # the last line was made
-    # Arrival of the command, and the mode, of the last line. None after a press: a new line is due.
-    made_of: tuple[Ns | None, Mode] | None = None
+    # The twist to follow and the mode of the last line. None after a press: a new line is due.
+    made_of: tuple[Twist | None, Mode] | None = None
     waiting: tuple[Motion, WheelSpeeds] | None = None  # for `sent`
     trip: Trip = ""  # why the guard replaced the last line, until the robot has latched the fault
     pressed_ns: Ns = 0  # last press of the emergency stop or a bumper

@@ -108,6 +108,11 @@ class Sender(Struct):
         if self.hint is not None:
             self.hint = replace(self.hint, at_ns=now_ns)
 
+    def repeats(self, command: Command, timeout_ns: Ns) -> bool:
+        """Return whether a command repeats the last one of a sender that is armed and live."""
+        unchanged = command.twist == self.twist and is_zero(command) == (self.zeros_ns is not None)
+        return unchanged and self.armed and self.is_live(command.arrived_ns, timeout_ns)
+
     def take(self, command: Command, timeout_ns: Ns) -> None:
         now_ns, zero = command.arrived_ns, is_zero(command)
         self.armed = self.is_armed(now_ns)
