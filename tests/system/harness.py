@@ -725,10 +725,11 @@ class Bus:
     def __exit__(self, *error: object) -> None:
         self.session.close()
 
-    def put(self, key: str, value: object, sender: str = "") -> None:
+    def put(self, key: str, value: object, sender: str = "", indent: int = 0) -> None:
         """Put JSON without an encoding, as a minimal client does. `sender` is an optional id."""
         attachment = json.dumps({"sender": sender}) if sender else None
-        self.session.put(f"{self.root}/{key}", json.dumps(value), attachment=attachment)
+        payload = json.dumps(value, indent=indent or None)
+        self.session.put(f"{self.root}/{key}", payload, attachment=attachment)
 
     def payload(self, key: str, payload: object) -> str | None:
         """Return the payload of a query as JSON.

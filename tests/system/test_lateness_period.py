@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import random
+import time
 from pathlib import Path
 
 import pytest
@@ -9,6 +11,7 @@ import pytest
 from tests.system.harness import (
     Bus,
     Daemon,
+    FarPeer,
     Periods,
     broken,
     cpu_seconds,
@@ -67,3 +70,44 @@ def test_without_commands_a_second_is_a_hundred_lines_and_every_gap_is_accounted
     tmp_path: Path,
 ) -> None:
     is_even(*undisturbed(tmp_path, 1.5))
+
+
+def off_the_tick(times: list[float]) -> int:
+    """Return how many of these times are more than 2 ms away from the usual phase of a period."""
+
+    def apart(a: float, b: float) -> float:
+        return abs((a - b + TICK_S / 2) % TICK_S - TICK_S / 2)
+
+    usual = max(times, key=lambda phase: sum(apart(at, phase) < 0.001 for at in times))
+    return sum(apart(at, usual) > 0.002 for at in times)
+
+
+@pytest.mark.slow
+def test_a_sender_that_repeats_its_speed_has_the_lines_of_the_periods(tmp_path: Path) -> None:
+    with (
+        FarPeer(tmp_path) as board,
+        Daemon(tmp_path, board.path) as daemon,
+        Bus(daemon.endpoint) as bus,
+    ):
+        bus.linked()
+        with bus.commanding(0.4) as commander:
+            time.sleep(1.0)
+            commander.silenced.set()
+            begun, waited = time.monotonic(), waited_for_a_core(daemon.pid)
+            dice = random.Random(1)
+            for number in range(80):
+                # Every 50 ms, each command would come at the same moment of a period.
+                time.sleep(dice.uniform(0.045, 0.055))
+                # An echo or a stamp makes other bytes each time. The same bytes wait for the tick.
+                bus.put(commander.key, commander.wish, commander.sender, indent=number % 2)
+            ended, waited = time.monotonic(), waited_for_a_core(daemon.pid) - waited
+            assert bus.state()["mode"] == "driving"
+        times = [line.at for line in board.since(begun) if line.at < ended]
+    off = off_the_tick(times)
+    print(
+        f"{len(times) / (ended - begun):.1f} lines/s, {100 * off / len(times):.1f} % off the tick"
+    )
+    assert len(times) <= 1.01 * (ended - begun) / TICK_S + 1
+    assert len(times) >= 0.97 * (ended - begun - waited) / TICK_S - 1
+    # The kernel may let the daemon wait for a core, and each wait may move some lines.
+    assert off <= len(times) / 10 + waited / 0.002
