@@ -66,9 +66,10 @@ class BoardInputs(Struct):
     def process_reports(self, session: McuSession, now_ns: Ns, config: Config) -> list[Event]:
         """Process the status lines of the last update, and return the events of changes."""
         statuses, safety, up = session.status.new, config.safety, session.link == "up"
+        late = session.steps.is_late
         return [
-            *self.estop.process_reports(statuses, now_ns, safety),
-            *self.bumpers.process_reports(statuses, now_ns, safety),
+            *self.estop.process_reports(statuses, now_ns, safety, late=late),
+            *self.bumpers.process_reports(statuses, now_ns, safety, late=late),
             *self.battery.process_reports(statuses, now_ns, up, config.battery),
         ]
 

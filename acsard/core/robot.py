@@ -66,9 +66,6 @@ MAX_DT = 0.05
 # stopped the motors. The margin is for a board whose clock is slightly fast.
 WRITE_PAUSE_S = WATCHDOG_S - 0.05
 
-# After a longer time between two steps, the second may be late: at least `LinkSetup.late_step_ns`.
-STEADY_STEP_NS = NS_PER_S // 20
-
 HALTED = (Mode.STOPPED, Mode.FAULT, Mode.SHUTDOWN)  # modes with the stop deceleration
 
 UNLATCHED = (Mode.DRIVING, Mode.READY)  # their reason depends only on the choice and the settings
@@ -110,10 +107,9 @@ class Robot:
         # Motion, twist, limits and cap with which the motion does not change; its wheel speeds.
         self._steady: tuple[tuple[Motion, Twist, LimitsConfig, float] | None, WheelSpeeds]
         self._steady = (None, STILL)
-        # The result of the last `hear` holds until then if only bytes arrive; 0: not even now.
-        self._until_ns: Ns = 0
-        self._silence = Heard(True)  # what `hear` gets if nothing arrives
-        self._is_watched = True  # the reports of the board may change the mode at any time
+        # Until then, a step decides nothing if it brings only lines; 0: not even now.
+        self._calm_until_ns: Ns = 0
+        self._nothing = Heard(True)  # what `hear` gets if nothing arrives
 
     def snapshot(self, now_ns: Ns) -> Snapshot:
         """Return what `state` and `diagnostics` need; too slow for every wake-up."""
@@ -202,33 +198,29 @@ class Robot:
 
     def hear(self, now: Instant, heard: Heard) -> News:
         """Process what arrived since the last call, and return what is to be published."""
-        state = self.state
-        now_ns, life, arbiter, session = now.mono_ns, state.life, state.arbiter, state.session
-        steady = now_ns - arbiter.begun_ns < STEADY_STEP_NS
-        holds = steady and now_ns < self._until_ns
-        if holds and heard == self._silence:
-            arbiter.begun_ns = session.lateness.looked_ns = now_ns
+        state, now_ns = self.state, now.mono_ns
+        life, arbiter, steps = state.life, state.arbiter, state.session.steps
+        before_ns = steps.begin(now_ns)
+        calm = steps.is_steady and now_ns < self._calm_until_ns
+        if calm and heard == self._nothing:
             return QUIET
-        events: list[Event] = []
-        if heard.events or state.announced:
-            events += heard.events + state.announced
-            state.announced = ()
-        arbiter.begin(now_ns, self.config.commands)
+        events = [*heard.events, *state.announced]
+        state.announced = ()
+        if before_ns is None:
+            arbiter.start(now_ns)
+        elif steps.is_late:
+            arbiter.resume(before_ns, now_ns, self.config.commands)
         if life.unshown:
             life.begin(now_ns)
         if heard.missed:
             state.count("missed_periods", heard.missed)
             events.append(missed(heard.missed, self.config.period_ns))
         estimates = self._fold(now, heard, events)
-        # Nothing below has anything to do if `_fold` only integrated lines. It makes an event for
-        # each fault, and one of both `until_ns` is 0 if the link is lost or a sender was disarmed.
-        until_ns = min(arbiter.until_ns, session.until_ns)
-        if holds and now_ns < until_ns and not (
-            events or self._is_watched or heard.commands or heard.refusals or heard.requests
-            or heard.speed_cap is not None or heard.shutting_down
-        ):  # fmt: skip
-            self._until_ns = until_ns
-            return News(estimates) if estimates else QUIET
+        if calm and heard.asks_nothing and not events:
+            # `_fold` makes an event for each fault, and a link that is lost ends the calm.
+            self._calm_until_ns = self._calm_until()
+            if now_ns < self._calm_until_ns:
+                return News(estimates) if estimates else QUIET
         answers: tuple[Answer, ...] = ()
         if heard.requests or state.last.trip or heard.shutting_down:
             answers = self._serve(now, heard, events)
@@ -249,16 +241,24 @@ class Robot:
         if changed or urgent:
             why = Reason(state.status.code, state.status.reason)
             events += state.command_events.changes(mode, state.choice, why)
-        logged: tuple[Event, ...] = ()
-        if events or state.throttle.held:
-            logged = state.throttle.lines(events, now_ns)
-        waits = urgent or state.throttle.held or life.unshown or self._is_watched or not steady
-        self._until_ns = 0
-        if not waits and mode in UNLATCHED:
-            self._until_ns = min(arbiter.until_ns, session.until_ns)
+        logged = state.throttle.lines(events, now_ns)
+        self._calm_until_ns = self._calm_until() if steps.is_steady and not urgent else 0
         if not (estimates or answers or logged or urgent or changed):
             return QUIET
         return News(estimates, answers, logged, urgent, changed)
+
+    def _calm_until(self) -> Ns:
+        # Until then nothing changes by itself: neither the choice nor the link, no latch holds, no
+        # event waits for its line, and no input of the board may fall silent.
+        state = self.state
+        if (
+            state.life.mode not in UNLATCHED
+            or state.life.unshown
+            or state.throttle.held
+            or state.inputs.expects_reports(state.session)
+        ):
+            return 0
+        return min(state.arbiter.until_ns, state.session.until_ns)
 
     def drive(self, now: Instant) -> bytes | None:
         """Return the line for the board: in each control period, and at once if `News` is urgent.
@@ -305,7 +305,7 @@ class Robot:
         state = self.state
         left = line is not None
         if trip or not left:
-            self._until_ns = 0
+            self._calm_until_ns = 0
         # The question moves nothing: a ramp continues from the line before it.
         state.last.sent(left and line != QUESTION_LINE, trip)
         # The board must not be expected to answer a line that the guard has replaced.
@@ -337,7 +337,7 @@ class Robot:
         if link != "up":
             if before == "up" and not state.life.port_released:
                 state.count("link_lost")
-                if session.lateness.late_s:
+                if session.steps.late_s:
                     state.count("link_lost_host_stall")
             state.sanity.forget()
             state.checks.wheels.pause()
@@ -349,9 +349,8 @@ class Robot:
             events += session.events
         if session.reopened:
             inputs.reopen()
-            self._silence = Heard(True, heard.opened)
+            self._nothing = Heard(True, heard.opened)
         is_watched, safety = inputs.expects_reports(session), self.config.safety
-        self._is_watched = is_watched
         if is_watched:
             self._watch_inputs(now, events)
         if link != "up":
@@ -462,7 +461,7 @@ class Robot:
         estop = state.inputs.estop
         pressed = estop.is_pressed or estop.pressed_now is not None
         wheels.commanded = None if pressed else state.last.written
-        wheels.late = state.session.lateness.step_s > WRITE_PAUSE_S
+        wheels.late = state.session.steps.step_s > WRITE_PAUSE_S
         estimate = state.odometry.fold(line, checks, self.model)
         if wheels.fault is not None:
             self._fault(wheels.fault, now, events)

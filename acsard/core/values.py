@@ -417,6 +417,17 @@ class Heard(Struct, frozen=True, omit_defaults=True):
     missed: int = 0  # control periods without a wake-up
     shutting_down: bool = False  # ramp to zero, and stay there
 
+    @property
+    def asks_nothing(self) -> bool:
+        """Whether there are at most bytes, gyro samples and events."""
+        return not (
+            self.commands
+            or self.refusals
+            or self.requests
+            or self.speed_cap is not None
+            or self.shutting_down
+        )
+
 
 class Status(Struct, frozen=True):
     mode: str

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 
 from acsard.core.config.settings import CommandsConfig, Source
+from acsard.core.link.step_times import StepTimes
 from acsard.core.motion.arbiter import Arbiter, Choice
 from acsard.core.values import NS_PER_S, REST, Command, SourceStatus, Twist
 
@@ -31,12 +32,21 @@ SOURCES = (
 )
 
 
+def begin(arbiter: Arbiter, steps: StepTimes, now_ns: int, commands: CommandsConfig) -> None:
+    """Begin a step, as the robot does."""
+    before_ns = steps.begin(now_ns)
+    if before_ns is None:
+        arbiter.start(now_ns)
+    elif steps.is_late:
+        arbiter.resume(before_ns, now_ns, commands)
+
+
 class Commanders:
     """Senders of `SOURCES`. Their clocks are ahead of the robot's by `offset_ns`."""
 
     def __init__(self, armed: bool = False, reverse: bool = False) -> None:
         self.commands = CommandsConfig(SOURCES[::-1] if reverse else SOURCES)
-        self.arbiter = Arbiter()
+        self.arbiter, self.steps = Arbiter(), StepTimes()
         self.now_ns = 10 * NS_PER_S
         self.offset_ns = 1_800_000_000 * NS_PER_S
         if armed:
@@ -88,7 +98,7 @@ class Commanders:
                 case ["reset"]:
                     self.arbiter.require_neutral(self.now_ns)
                 case ["wake"]:
-                    self.arbiter.begin(self.now_ns, self.commands)
+                    begin(self.arbiter, self.steps, self.now_ns, self.commands)
                 case [who, what]:
                     assert self.act(who, what) == refused.strip(), step
             if driver:

@@ -61,6 +61,7 @@ class LinkBench:
         self.now_ns += int(ms * MS)
         received = tuple(Received(self.now, data) for data in reads)
         self.session.sent(self.setup, self.made_ns, was_written=left)
+        self.session.steps.begin(self.now_ns)
         return self.session.update(self.setup, self.now, self.port_open, self.opened, received)
 
     def wait(self, ms: float, *reads: bytes) -> list[Feedback]:

@@ -8,6 +8,7 @@ from typing import get_args
 from acsard.core.codes import Reason, joined, reason
 from acsard.core.config.settings import Place, SafetyConfig
 from acsard.core.link.board_status import BoardStatus
+from acsard.core.link.step_times import LATE_NS
 from acsard.core.motion import bumpers as bumpers_module
 from acsard.core.motion.bumpers import Bumpers, pressed_words
 from acsard.core.motion.emergency_stop import PRESSED_REASON, TRANSITIONS, EmergencyStop, Sign
@@ -54,7 +55,8 @@ class Input:
             else:
                 line = BoardStatus(estop=marks == "!" if marks else None)
             lines.append((now_ns, line))
-        events = self.part.process_reports(lines, now_ns, self.safety)
+        late = ms * MS > LATE_NS
+        events = self.part.process_reports(lines, now_ns, self.safety, late=late)
         self.events += [(event.name, event.code) for event in events]
         return self.part.state
 

@@ -13,11 +13,13 @@ from acsard.core.link.link_diagnosis import (
     MAX_UNANSWERED_FRACTION,
     WINDOW_LINES,
     Heard,
-    Lateness,
     SilenceDiagnosis,
     UnansweredLines,
+    describe_state,
 )
 from acsard.core.link.link_setup import LinkSetup
+from acsard.core.link.link_state import State
+from acsard.core.link.step_times import StepTimes
 from tests.each import each
 from tests.unit.link_bench import GOOD, MS, STOP, LinkBench
 
@@ -131,17 +133,18 @@ def test_lines_too_far_apart_are_reported_with_a_setting_only_if_it_is_valid(
 # delays of this computer
 
 
-def after(*steps_ms: int, good: bool = False) -> Lateness:
+def after(*steps_ms: int, good: bool = False) -> StepTimes:
     """Check the lateness after each of these time steps. A good line arrives at time 0.
 
     `good` says whether another good line arrives in the last step.
     """
-    lateness, now_ns = Lateness(), 0
-    lateness.record_step(REAL, now_ns, good=True)
+    steps, now_ns = StepTimes(0), 0
+    steps.judge_lines(REAL, good=True)
     for number, step_ms in enumerate(steps_ms, 1):
         now_ns += step_ms * MS
-        lateness.record_step(REAL, now_ns, good=good and number == len(steps_ms))
-    return lateness
+        steps.begin(now_ns)
+        steps.judge_lines(REAL, good=good and number == len(steps_ms))
+    return steps
 
 
 @each(
@@ -159,9 +162,10 @@ def after(*steps_ms: int, good: bool = False) -> Lateness:
 def test_a_stale_link_is_blamed_on_the_board_unless_the_host_was_late(
     steps: list[int], good: bool, late_s: float, code: str
 ) -> None:
-    lateness = after(*steps, good=good)
-    assert (lateness.late_s, lateness.describe(REAL, "stale").code) == (late_s, code)
-    assert [lateness.describe(REAL, state).code for state in ("up", "booting", "down")] == [
+    times = after(*steps, good=good)
+    assert (times.late_s, describe_state(REAL, "stale", times).code) == (late_s, code)
+    states: list[State] = ["up", "booting", "down"]
+    assert [describe_state(REAL, state, times).code for state in states] == [
         "link_up", "booting", "port_closed",
     ]  # fmt: skip
 

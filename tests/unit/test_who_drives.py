@@ -9,6 +9,7 @@ from typing import get_args
 
 from acsard.core.codes import ObjectionCode, Reason, WaitCode
 from acsard.core.config.settings import CommandsConfig, Source
+from acsard.core.link.step_times import StepTimes
 from acsard.core.motion.arbiter import Arbiter, Choice
 from acsard.core.motion.arbiter_text import (
     MAX_SENDER_LENGTH,
@@ -21,7 +22,7 @@ from acsard.core.motion.arbiter_text import (
 from acsard.core.motion.modes import Mode
 from acsard.core.values import NS_PER_S, REST, Command, Echo, Event, Refusal, Wait
 from tests.each import each
-from tests.unit.commanders import GO, MS, SOURCES, Commanders
+from tests.unit.commanders import GO, MS, SOURCES, Commanders, begin
 
 ARMED = {
     "nobody without a command": "> -",
@@ -170,12 +171,13 @@ def test_a_choice_holds_until_the_time_that_the_arbiter_names(seed: int) -> None
     long = Source("long", 5, timeout=3.0)
     commands = CommandsConfig(sources=(SOURCES[0], SOURCES[4], long))
     each_time, at_deadlines = Arbiter(), Arbiter()
+    steps = {id(arbiter): StepTimes() for arbiter in (each_time, at_deadlines)}
     now_ns = next_ns = 10 * NS_PER_S
     kept = 0
     for _ in range(4000):
         now_ns += dice.choice((1, MS, 7 * MS, 10 * MS))
         for arbiter in (each_time, at_deadlines):
-            arbiter.begin(now_ns, commands)
+            begin(arbiter, steps[id(arbiter)], now_ns, commands)
         if now_ns >= next_ns:
             next_ns = now_ns + dice.choice((1, 20 * MS, 50 * MS, 260 * MS, 3100 * MS))
             twist, source = dice.choice((REST, REST, GO)), dice.choice(("high", "low", "long"))

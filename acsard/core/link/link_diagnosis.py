@@ -17,6 +17,7 @@ from acsard.core.link.codec import TOKENS
 from acsard.core.link.link_setup import LinkSetup
 from acsard.core.link.link_state import Link
 from acsard.core.link.link_state import State as LinkState
+from acsard.core.link.step_times import StepTimes
 from acsard.core.values import NS_PER_S, Event, Ns
 
 BUSY_ADVICE = CODES["host_late"].advice
@@ -71,43 +72,6 @@ PORT_BLOCKED = sentence("port_blocked")
 WINDOW_LINES = 1000  # sent lines whose answers are counted: 10 s at 100 Hz
 
 MAX_UNANSWERED_FRACTION = 0.02  # a good link loses no answer
-
-
-class Lateness(Struct):
-    """Detects control steps that come too late.
-
-    The daemon reads the board's lines only in its steps, so the board is not to blame for a silence
-    that ends with a late one.
-    """
-
-    looked_ns: Ns | None = None
-    late_s: float = 0.0  # longest time between two steps since the last good line, if late
-    step_s: float = 0.0  # between the last two steps, if the last was late
-
-    def record_step(self, setup: LinkSetup, now_ns: Ns, good: bool) -> bool:
-        """Record a step, and return whether it ends a silence that this computer caused.
-
-        Only a good line ends one. The built-in simulator runs on this computer, so with it the
-        result is True for every good line.
-        """
-        before_ns, self.looked_ns = self.looked_ns, now_ns
-        passed_ns = 0 if before_ns is None else now_ns - before_ns
-        if passed_ns < setup.late_step_ns and not self.late_s:
-            self.step_s = 0.0
-            return good and setup.mcu.simulated
-        step_s = self.step_s = passed_ns / NS_PER_S if passed_ns >= setup.late_step_ns else 0.0
-        late_s = step_s if step_s > self.late_s else self.late_s
-        self.late_s = 0.0 if good else late_s
-        return good and (late_s > 0.0 or setup.mcu.simulated)
-
-    def describe(self, setup: LinkSetup, link: LinkState) -> Reason:
-        """Return a sentence about the link, which may blame this computer or the simulator."""
-        if link == "stale" and self.late_s:
-            received = "nothing from the microcontroller"
-            return sentence("host_late", seconds=self.late_s, received=received)
-        if link == "stale" and setup.mcu.simulated:
-            return SIMULATOR_FAULT
-        return STATE_REASONS[link]
 
 
 class Heard(Struct):
@@ -247,7 +211,7 @@ class UnansweredLines(Struct):
 
 
 def describe_link(
-    setup: LinkSetup, link: Link, silence: SilenceDiagnosis, lateness: Lateness
+    setup: LinkSetup, link: Link, silence: SilenceDiagnosis, steps: StepTimes
 ) -> Reason:
     """Return a sentence about the link while the port is open."""
     checked = setup.checked
@@ -261,7 +225,17 @@ def describe_link(
             return _sparse(link.sparse_s, setup.longest_reply)
         if traffic is not None:
             return traffic.diagnosis(checked)
-    return lateness.describe(setup, link.state)
+    return describe_state(setup, link.state, steps)
+
+
+def describe_state(setup: LinkSetup, link: LinkState, steps: StepTimes) -> Reason:
+    """Return a sentence about the state of the link, which may blame this computer."""
+    if link == "stale" and steps.late_s:
+        received = "nothing from the microcontroller"
+        return sentence("host_late", seconds=steps.late_s, received=received)
+    if link == "stale" and setup.mcu.simulated:
+        return SIMULATOR_FAULT
+    return STATE_REASONS[link]
 
 
 def _sparse(sparse_s: float, longest_reply: float) -> Reason:

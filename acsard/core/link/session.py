@@ -19,12 +19,13 @@ from acsard.core.link.codec import FrameError
 from acsard.core.link.echo_check import QUESTION, WINDOW_NS, EchoCheck
 from acsard.core.link.feedback import Feedback, Timeline
 from acsard.core.link.lines import LineReader
-from acsard.core.link.link_diagnosis import Lateness, SilenceDiagnosis
+from acsard.core.link.link_diagnosis import SilenceDiagnosis
 from acsard.core.link.link_setup import LinkSetup
 from acsard.core.link.link_state import GOOD_LINES, WATCHDOG_NS, WATCHDOG_S, Link
 from acsard.core.link.link_state import State as LinkState
 from acsard.core.link.pose_doubt import PoseDoubt
 from acsard.core.link.quantization import CountRecovery
+from acsard.core.link.step_times import StepTimes
 from acsard.core.values import (
     NS_PER_S,
     STILL,
@@ -76,7 +77,7 @@ class McuSession(Struct):
     blocked: bool = False  # the open port's driver has accepted no line for `WATCHDOG_NS`
     good_lines: int = 0
     rejects: dict[str, int] = {}  # by reason
-    lateness: Lateness = field(default_factory=Lateness)
+    steps: StepTimes = field(default_factory=StepTimes)
     status: StatusReports = field(default_factory=StatusReports)
     count_recovery: CountRecovery = field(default_factory=CountRecovery)
     doubt: PoseDoubt = field(default_factory=PoseDoubt)
@@ -142,12 +143,12 @@ class McuSession(Struct):
                 if more := self._lines.too_long - self.rejects.get("too_long", 0):
                     self._reject("too_long", more=more)
                     link.bad(setup.checked)
-            lateness = self.lateness
-            if lateness.record_step(setup, now_ns, good=bool(feedback)):
+            steps = self.steps
+            if steps.judge_lines(setup, good=bool(feedback)):
                 link.reset_silences()
             if (
-                lateness.step_s
-                and lateness.step_s < WATCHDOG_S
+                steps.step_s
+                and steps.step_s < WATCHDOG_S
                 and not setup.mcu.reply_period
                 and not feedback
             ):
@@ -218,7 +219,7 @@ class McuSession(Struct):
             return link_diagnosis.PORT_BLOCKED
         if self._trouble and self.link in ("booting", "stale"):
             return sentence(self._trouble)
-        return link_diagnosis.describe_link(setup, self._link, self._hearing, self.lateness)
+        return link_diagnosis.describe_link(setup, self._link, self._hearing, self.steps)
 
     @property
     def _trouble(self) -> Trouble:
@@ -292,7 +293,7 @@ class McuSession(Struct):
         link = self._link
         if not self._held_up:
             self.blocked = False
-        elif now_ns - self._left_ns > WATCHDOG_NS and not self.lateness.step_s:
+        elif now_ns - self._left_ns > WATCHDOG_NS and not self.steps.step_s:
             # In a late step, the last written line is old because this computer did not run.
             self.blocked = True
         if self.blocked:
@@ -308,11 +309,11 @@ class McuSession(Struct):
             link.judge(now_ns, may_rise=not held, checked=setup.checked)
         self.link, up = link.state, link.state == "up"
         if self.status.up_ns is not None:  # else nothing is to be forgotten
-            self.status.judge(now_ns, up, late=self.lateness.step_s > 0.0)
+            self.status.judge(now_ns, up, late=self.steps.step_s > 0.0)
         if up or self.blocked:
             if self.blocked or not was_up:  # the diagnosis of a link that stays up is empty
                 self._hearing.forget()
-        elif self._hearing.judge(now_ns, self.lateness.step_s):
+        elif self._hearing.judge(now_ns, self.steps.step_s):
             # The board may answer only plain lines, such as the first one after the opening.
             self._unchecked = self._unchecked or self._plain_lines > 0
             why = self.describe_link(setup)
@@ -344,7 +345,11 @@ class McuSession(Struct):
         self._announced = (link, trouble, self.blocked)
         if link != before[0] or self.blocked > before[2]:
             plain = not (self.blocked or self._link.damaged or trouble)
-            why = self.lateness.describe(setup, link) if plain else self.describe_link(setup)
+            why = (
+                link_diagnosis.describe_state(setup, link, self.steps)
+                if plain
+                else self.describe_link(setup)
+            )
             good = link in ("up", "booting") and not self.blocked
             level: Level = "info" if good else "warning"
             self.events.append(Event(NAMES[link], why.text, level, code=why.code))

@@ -15,8 +15,8 @@ from msgspec import Struct, field
 
 from acsard.core.codes import AgeCode
 from acsard.core.config.settings import CommandsConfig, Source
+from acsard.core.link.step_times import CATCH_UP_NS
 from acsard.core.motion.ages import MARGIN_NS, SILENT_NS, Ages, Order
-from acsard.core.motion.emergency_stop import CATCH_UP_NS, LATE_STEP_NS
 from acsard.core.motion.neutral import FOREVER_NS, NEUTRAL_PAUSE_NS, Hint, Sender, is_zero
 from acsard.core.values import NS_PER_S, REST, Command, Ns, SourceStatus, Twist, Wait
 
@@ -79,7 +79,6 @@ class Arbiter(Struct):
     sources: dict[str, SourceSenders] = {}
     holder: tuple[str, str] = NOBODY  # source that drives or waits, and sender that drives
     since_ns: Ns = 0  # zeros from then on arm
-    begun_ns: Ns = 0  # last step
     caught_up_ns: Ns = 0  # until then, commands may arrive that waited during the last stall
     # From then on a pause counts: the robot could drive, and the daemon did not stand still.
     watched_ns: Ns = 0
@@ -103,17 +102,14 @@ class Arbiter(Struct):
         for source in self.sources.values():
             source.ages = Ages()
 
-    def begin(self, now_ns: Ns, commands: CommandsConfig) -> None:
-        """Begin a step. After `LATE_STEP_NS`, the bus may not have delivered all commands."""
-        before_ns, self.begun_ns = self.begun_ns, now_ns
-        if now_ns - before_ns <= LATE_STEP_NS:
-            return
-        self.until_ns = 0
-        if before_ns:
-            self.caught_up_ns = now_ns + CATCH_UP_NS
-            self.watched_ns = max(self.watched_ns, now_ns)
-        else:
-            self.watched_ns = now_ns + RECONNECT_NS
+    def start(self, now_ns: Ns) -> None:
+        """Begin the first step."""
+        self.watched_ns = now_ns + RECONNECT_NS
+
+    def resume(self, before_ns: Ns, now_ns: Ns, commands: CommandsConfig) -> None:
+        """Begin a late step, before which the bus may not have delivered all commands."""
+        self.until_ns, self.caught_up_ns = 0, now_ns + CATCH_UP_NS
+        self.watched_ns = max(self.watched_ns, now_ns)
         for settings in commands.sources:
             if (source := self.sources.get(settings.name)) is not None:
                 for sender in source.senders.values():

@@ -18,6 +18,7 @@ from msgspec import Struct
 from acsard.core.codes import Reason, reason, sentence
 from acsard.core.config.settings import EstopUse, SafetyConfig
 from acsard.core.link.board_status import BoardStatus
+from acsard.core.link.step_times import CATCH_UP_NS
 from acsard.core.values import NS_PER_S, EstopState, Event, EventName, Ns
 
 Sign = Literal["ok", "pressed", "silence"]
@@ -34,12 +35,6 @@ TRANSITIONS: dict[tuple[EstopState, Sign], EstopState] = {
 }
 
 SILENCE_TIMEOUT_S = 0.5  # five status lines at 10 Hz
-
-# A step this long after the previous one is late. The longest control period is 100 ms.
-LATE_STEP_NS = 150_000_000
-
-# For this time after a late step the board is not silent: its lines of that time are still read.
-CATCH_UP_NS = 100_000_000
 
 PRESSED_REASON = reason("emergency_stop")
 SILENT_REASON = reason("emergency_stop_silent", seconds=SILENCE_TIMEOUT_S)
@@ -59,7 +54,6 @@ class BoardInput(Struct):
     awaited: bool = True  # until the board on the newly opened port reports the inputs
     pressed_now: Reason | None = None  # by the last `process_reports`
     reported_ns: Ns = 0
-    looked_ns: Ns = 0  # last step
     excused: bool = False  # a late step, since the last report
 
     def why(self, safety: SafetyConfig) -> Reason | None:
@@ -88,9 +82,14 @@ class BoardInput(Struct):
             self.state, self.pressed = "", None
 
     def process_reports(
-        self, reports: Sequence[tuple[int, BoardStatus]], now_ns: Ns, safety: SafetyConfig
+        self,
+        reports: Sequence[tuple[int, BoardStatus]],
+        now_ns: Ns,
+        safety: SafetyConfig,
+        *,
+        late: bool,
     ) -> list[Event]:
-        """Process status lines with their arrival; return the events of changes."""
+        """Process status lines with their arrival in a step; return the events of changes."""
         self.pressed_now = None
         if self.use(safety) == "off":
             return []
@@ -100,7 +99,6 @@ class BoardInput(Struct):
             if pressed is not None:
                 self.reported_ns, self.excused, self.awaited = at_ns, False, False
                 events += self._take("pressed" if any(pressed) else "ok", pressed, safety)
-        late, self.looked_ns = now_ns - self.looked_ns > LATE_STEP_NS, now_ns
         if self.pressed is not None and now_ns - self.reported_ns > _SILENT_NS:
             # Excuse a late step once between two reports, or a loop that is always late would delay
             # the stop forever.
@@ -155,7 +153,12 @@ class EmergencyStop(BoardInput):
     unpowered: bool = False
 
     def process_reports(
-        self, reports: Sequence[tuple[int, BoardStatus]], now_ns: Ns, safety: SafetyConfig
+        self,
+        reports: Sequence[tuple[int, BoardStatus]],
+        now_ns: Ns,
+        safety: SafetyConfig,
+        *,
+        late: bool,
     ) -> list[Event]:
         self.driver_fault, pressed = False, self.is_pressed
         self.unpowered |= self.state == "pressed"
@@ -164,7 +167,7 @@ class EmergencyStop(BoardInput):
                 pressed = status.estop
                 self.unpowered |= pressed
             self.driver_fault |= bool(status.driver_fault) and not (pressed or self.unpowered)
-        events = super().process_reports(reports, now_ns, safety)
+        events = super().process_reports(reports, now_ns, safety, late=late)
         if self.is_pressed:
             self.driver_fault = False
         return events

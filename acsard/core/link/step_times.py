@@ -1,0 +1,54 @@
+"""Decides whether a step of the control loop is late, for all parts of the robot.
+
+The daemon reads lines, reports and commands only in its steps. What comes with a late step may have
+waited, so neither the board nor a sender is to blame for a silence that ends with one.
+"""
+
+from __future__ import annotations
+
+from msgspec import Struct
+
+from acsard.core.link.link_setup import LinkSetup
+from acsard.core.values import NS_PER_S, Ns, Seconds
+
+# Between two steps: until then no part has to ask. It is the least `LinkSetup.late_step_ns`.
+STEADY_NS = NS_PER_S // 20
+
+# Between two steps: the second is late for commands and reports. The longest period is 100 ms. A
+# line is missing earlier, by `LinkSetup.late_step_ns`.
+LATE_NS = 150_000_000
+
+CATCH_UP_NS = 100_000_000  # after a late step, what waited is still being read
+
+
+class StepTimes(Struct):
+    at_ns: Ns | None = None  # last step
+    passed_ns: Ns = 0  # between the last two steps
+    step_s: Seconds = 0.0  # the same, if lines may be missing for it
+    late_s: Seconds = 0.0  # largest `step_s` since the last good line
+
+    def begin(self, now_ns: Ns) -> Ns | None:
+        """Begin a step, and return when the one before began."""
+        before_ns, self.at_ns = self.at_ns, now_ns
+        self.passed_ns = 0 if before_ns is None else now_ns - before_ns
+        return before_ns
+
+    @property
+    def is_steady(self) -> bool:
+        return self.passed_ns < STEADY_NS
+
+    @property
+    def is_late(self) -> bool:
+        return self.passed_ns > LATE_NS
+
+    def judge_lines(self, setup: LinkSetup, good: bool) -> bool:
+        """Return whether this step ends a silence of the board that this computer caused.
+
+        Only a good line ends one. The built-in simulator runs on this computer, so with it the
+        result is True for every good line.
+        """
+        late = self.passed_ns >= setup.late_step_ns
+        self.step_s = self.passed_ns / NS_PER_S if late else 0.0
+        late_s = max(self.late_s, self.step_s)
+        self.late_s = 0.0 if good else late_s
+        return good and (late_s > 0.0 or setup.mcu.simulated)
