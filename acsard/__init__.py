@@ -10,7 +10,7 @@ step every 10 ms. A second process, the gateway, terminates TLS connections from
  timer ------------> robot.drive(now) --> line --> guard --> port --> robot.sent(left_ns, line)
 
 `hear` updates the odometry from the feedback, chooses one command and checks that the mode allows
-it. `drive`, in each control period and at once for a new command, limits it and returns the line
+it. `drive`, in each control period and at once for another speed, limits it and returns the line
 for the board. `sent` says which line really left. No other function decides how the robot moves.
 
 Where to look: each package may import only the packages below it in this list.
@@ -45,13 +45,14 @@ Inside `core/`, in the same order:
 
     core/simulator/  the vehicle, the simulated microcontroller and its faults
     core/robot.py    hear, drive and sent; core/guard.py checks each outgoing line
+    core/robot_state.py  all that the robot knows between two steps; a recording stores it as it is
     core/reasons.py  the text in `reason`
     core/board_inputs.py  emergency stop, bumpers and battery, as the board reports them
     core/incoming/   input from the bus: turns samples into commands, and answers queries
     core/ros/        the two ROS transports: names, hashes, tokens, attachments, parameters
     core/messages/   the published structs, the table of keys, encodings, reports, schemas
     core/motion/     kinematics, odometry, consistency checks, arbiter, ages, limits, modes
-    core/link/       the serial line: codec, checksum, question, sample times, link state
+    core/link/       the serial line: codec, checksum, question, sample times, late steps, state
     core/config/     turns acsard.toml into one frozen Config, or into errors that name the key
                      and the remedy
     core/values.py   the values in SI units: Instant, Twist, Pose, Command, Heard, News
