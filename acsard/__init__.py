@@ -29,7 +29,7 @@ Where to look: each package may import only the packages below it in this list.
                      or a fault latched over a restart
     daemon/gateway/  `acsard gateway`: the process that terminates TLS connections
     daemon/bus/      the robot's keys: subscriptions, publications, replies to queries
-    daemon/serial/   the serial port
+    daemon/serial/   the serial port: pyserial-asyncio reads it, the daemon writes it
     recording/       the black box: writes the steps to files, deletes old files, reads the
                      files, and replays them
     bus/             Zenoh for every process: addresses, sessions, access rules, certificates,

@@ -25,7 +25,38 @@ from acsard.host.threads import NoThreadError, begin
 _left_open: list[int] = []  # descriptors that `close` had no thread for
 
 
-def open_raw(path: str, baud_rate: int) -> serial.Serial:
+class Device(serial.Serial):  # type: ignore[misc]
+    """A serial port for an asyncio transport: each read or write is one system call.
+
+    A read returns all bytes that the driver holds, or none. It raises `serial.SerialException` if
+    the device is gone. A write returns the number of bytes that the kernel accepts now.
+    """
+
+    # The descriptor never blocks. The transport sets both timeouts, and for each one pyserial would
+    # set up the open port again, which a driver may block.
+    timeout = write_timeout = property(lambda self: 0.0, lambda self, seconds: None)
+
+    def read(self, size: int = 0) -> bytes:
+        # The transport asks for 1024 bytes. After a stall of 0.4 s the lines are longer than that,
+        # and one step must hear all of them.
+        try:
+            data = os.read(self.fd, 4096)  # the size of a driver's buffer
+        except BlockingIOError:
+            return b""  # a late step has read them
+        except OSError as error:
+            raise serial.SerialException(*error.args) from error
+        if not data:
+            raise serial.SerialException(errno.EIO, "the serial device was disconnected")
+        return data
+
+    def write(self, data: bytes) -> int:
+        return os.write(self.fd, data)
+
+    def flush(self) -> None:
+        pass  # the transport calls this when it ends, and a driver may take 30 s to drain
+
+
+def open_raw(path: str, baud_rate: int) -> Device:
     """Open the port in raw mode, lock it and empty its buffers. Raises `OSError`."""
     # Close the devices that `close` could not close. Two threads may empty the list at the same
     # time.
@@ -34,9 +65,7 @@ def open_raw(path: str, baud_rate: int) -> serial.Serial:
             _end(_left_open.pop())
     # An inter-byte timeout makes pyserial set VMIN = 1. A read without data then fails with EAGAIN,
     # so an empty read always means a hang-up.
-    device = serial.Serial(
-        baudrate=baud_rate, timeout=0, write_timeout=0, inter_byte_timeout=0, exclusive=True
-    )
+    device = Device(baudrate=baud_rate, inter_byte_timeout=0, exclusive=True)
     device.port = path
     try:
         device.open()

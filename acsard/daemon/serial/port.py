@@ -1,7 +1,6 @@
 """The daemon's serial port: opens, reads and reopens the device, and sends STOP before closing it.
 
-The event loop watches the descriptor, and the daemon reads and writes it itself: a transport would
-queue bytes that the kernel does not accept and send an old line later. Opening runs in a thread
+The transport of pyserial-asyncio reads the device and reports its loss. Opening runs in a thread
 with a time limit, because drivers may block.
 """
 
@@ -13,11 +12,11 @@ import itertools
 import os
 from collections.abc import Callable
 
-import serial
+from serial_asyncio import SerialTransport, connection_for_serial
 
 from acsard.core.link.serial_output import Offered, Port, SerialOutput
 from acsard.core.values import Event, Instant, Ns, Received
-from acsard.daemon.serial.device import close, draining, open_raw, refusal, unsent
+from acsard.daemon.serial.device import Device, close, draining, open_raw, refusal, unsent
 from acsard.host import clock
 from acsard.host.clock import SuspendDetector
 from acsard.host.errors import InUseError, MendableError, NotPermittedError
@@ -36,7 +35,7 @@ DRIVER_HUNG = "the driver of the serial port did not answer"
 FINAL_STOP_TIMEOUT_S = 0.15  # twice a line at the lowest baud rate, plus a margin
 
 
-class SerialPort(Port):
+class SerialPort(Port, asyncio.Protocol):
     """The serial port to the board, for the duration of an `async with` block.
 
     `keep_open` reopens it. At the end, the port sends STOP.
@@ -61,10 +60,10 @@ class SerialPort(Port):
         self._wake, self._log = wake, log
         self._received: list[Received] = []
         self._output = SerialOutput(baud_rate, stop, period_ns)
-        self._device: serial.Serial | None = None  # while it is open
+        self._device: Device | None = None  # while it is open
+        self._transport: SerialTransport  # the device's
         self._lost, self._ours = asyncio.Event(), asyncio.Event()
         self._ours.set()  # the port is not released
-        self._fd = -1
         # Devices that threads are opening: `st_dev`, `st_ino`.
         self._opening = set[tuple[int, int]]()
         self.trouble = ""
@@ -72,9 +71,13 @@ class SerialPort(Port):
     # The control loop calls the methods below, which `Port` describes.
 
     def take(self, late: Instant | None = None) -> tuple[Received, ...]:
-        if late is not None and self.is_open:
+        if late is not None and self._device is not None:
             # Without the waiting bytes, the delay of the step would look like silence of the board.
-            self._read(late)
+            try:
+                if data := self._device.read():
+                    self._received.append(Received(late, data))
+            except OSError as error:
+                self._leave(error)
         if not self._received:
             return ()
         pieces = tuple(self._received)
@@ -87,15 +90,18 @@ class SerialPort(Port):
         # before it can move the robot.
         if self._asleep.detect():
             self._leave(OSError(errno.EIO, "this computer was suspended"))
-        if not self.is_open:
+        device = self._device
+        if device is None:
             return "down"
         # Ask the driver for the unsent bytes before reading the clock, because asking takes time.
-        waiting = unsent(self._fd)
+        waiting = unsent(device.fd)
         data = self._output.prepare(line, now.mono_ns, clock.mono_ns(), waiting)
         if data is None:
             return "superseded"
+        # The line goes to the device, because the transport would queue bytes that the kernel does
+        # not accept, and send an old line later.
         try:
-            byte_count = os.write(self._fd, data)
+            byte_count = device.write(data)
         except BlockingIOError:
             byte_count = 0
         except OSError as error:
@@ -157,7 +163,7 @@ class SerialPort(Port):
             raise OSError(errno.EIO, DRIVER_HUNG)
         opening.add(which)
 
-        def open_port() -> serial.Serial:
+        def open_port() -> Device:
             try:
                 return open_raw(path, baud_rate)
             finally:
@@ -175,10 +181,11 @@ class SerialPort(Port):
             device.close()
             raise OSError(errno.EBUSY, "the port was released meanwhile")
         self._lost.clear()
-        self._device, self._fd = device, device.fileno()
         self._output, self.sent_ns = SerialOutput(baud_rate, self._stop, self._period_ns), 0
         self._received.clear()
-        asyncio.get_running_loop().add_reader(self._fd, self._readable)
+        loop = asyncio.get_running_loop()
+        self._transport, _ = await connection_for_serial(loop, lambda: self, device)
+        self._device = device
         self.is_open, self.trouble = True, ""
         self.opened += 1
         self._log(Event("port_open", f"{path} at {baud_rate} baud"))
@@ -191,27 +198,16 @@ class SerialPort(Port):
             self.trouble = text
             self._log(Event("port_waiting", text, "warning"))
 
-    # Reading and losing the port.
+    # Reading and losing the port. The transport calls the first two methods.
 
-    def _readable(self) -> None:
+    def data_received(self, data: bytes) -> None:
         now = clock.now()
-        if self._read(now):
-            self._wake(now)
+        self._received.append(Received(now, data))
+        self._wake(now)
 
-    def _read(self, now: Instant) -> bool:
-        # Whether there were bytes.
-        try:
-            data = os.read(self._fd, 4096)  # the size of a driver's buffer
-        except BlockingIOError:
-            return False  # a late step has read them
-        except OSError as error:
-            self._leave(error)
-            return False
-        if data:
-            self._received.append(Received(now, data))
-            return True
-        self._leave(OSError(errno.EIO, "the serial device was disconnected"))
-        return False
+    def connection_lost(self, error: Exception | None) -> None:
+        # One round of the event loop after the loss, or after `_leave`: the port is not open again.
+        self._leave(error)
 
     def _leave(self, error: BaseException | None) -> None:
         # None: the daemon ends, or releases the port.
@@ -219,7 +215,8 @@ class SerialPort(Port):
         if device is None:
             return
         self.is_open = False
-        asyncio.get_running_loop().remove_reader(self._fd)
+        if not self._transport.is_closing():  # it has not found the loss itself
+            self._transport.abort()
         close(device, lost=error is not None)
         device.close()  # /dev/null
         if error is not None:
@@ -237,6 +234,7 @@ class SerialPort(Port):
             if clock.now().mono_ns > deadline_ns:
                 break
             await asyncio.sleep(0.001)
-        for pause in draining(self._fd, deadline_ns) if self.is_open else ():
-            await asyncio.sleep(pause)
+        if self._device is not None:
+            for pause in draining(self._device.fd, deadline_ns):
+                await asyncio.sleep(pause)
         self._leave(None)
