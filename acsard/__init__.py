@@ -7,7 +7,7 @@ step every 10 ms. A second process, the gateway, terminates TLS connections from
  serial -> lines --> robot.hear(now, heard) --> estimates, events, answers --> bus
  bus ----> decode ->        |
                             v
- timer ------------> robot.drive(now) --> line --> guard --> port --> robot.sent(left_ns, line)
+ timer ------------> robot.drive(now) --> line --> guard --> port --> robot.sent(at_ns, line)
 
 `hear` updates the odometry from the feedback, chooses one command and checks that the mode allows
 it. `drive`, in each control period and at once for another speed, limits it and returns the line

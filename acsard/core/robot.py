@@ -22,18 +22,19 @@ from acsard.core.link.board_status import as_text
 from acsard.core.link.feedback import Feedback
 from acsard.core.link.link_setup import LinkSetup
 from acsard.core.link.link_state import WATCHDOG_S
-from acsard.core.link.session import QUESTION_LINE
+from acsard.core.link.output import QUESTION_LINE
 from acsard.core.motion.arbiter_text import missed, refused, waiting
 from acsard.core.motion.battery import empty_reason
 from acsard.core.motion.emergency_stop import DRIVER_FAULT_REASON
 from acsard.core.motion.kinematics import Kinematics
-from acsard.core.motion.limits import AT_REST, Motion
+from acsard.core.motion.limits import coast, follow
 from acsard.core.motion.modes import Mode, RefusedError
 from acsard.core.motion.uncertainty import ErrorModel
 from acsard.core.motion.wheels import LEAST_SPEED
 from acsard.core.reasons import reason_of
 from acsard.core.robot_state import State, initial
 from acsard.core.values import (
+    AT_REST,
     NS_PER_S,
     REST,
     STILL,
@@ -44,6 +45,7 @@ from acsard.core.values import (
     Heard,
     Instant,
     Latches,
+    Motion,
     News,
     Ns,
     Plain,
@@ -179,7 +181,8 @@ class Robot:
     @property
     def applied(self) -> Twist:
         """The twist in the line of `drive`, after all limits; after `sent`, in the last one."""
-        return self.state.last.applied
+        last = self.state.last
+        return (last if last.waits else self.state.out).motion.twist
 
     @property
     def speeds(self) -> WheelSpeeds:
@@ -268,52 +271,58 @@ class Robot:
         """
         state = self.state
         now_ns, twist, limits = now.mono_ns, state.choice.twist, self.config.limits
-        last, mode = state.last, state.life.mode
+        last, out, mode = state.last, state.out, state.life.mode
         last.made_of, last.made_ns = (state.choice.twist, mode), now_ns
-        since = (now_ns - last.left_ns) / NS_PER_S
-        pressed = last.left_ns < last.pressed_ns
+        since = (now_ns - out.made_ns) / NS_PER_S
+        pressed = out.made_ns < last.pressed_ns
         if pressed or state.session.link != "up" or since > WRITE_PAUSE_S:
             # The first written line after a press contains zeros, even if the input is already
             # released and the commands that arrived meanwhile may move the robot.
             motion, speeds = AT_REST, STILL
         elif mode is Mode.DRIVING and twist is not None:
             cap = math.inf if state.cap.speed is None else state.cap.speed
-            wanted = (last.motion, twist, limits, cap)
+            wanted = (out.motion, twist, limits, cap)
             steady, speeds = self._steady
             if wanted == steady:
-                motion = last.motion
+                motion = out.motion
             else:
                 dt = min(since, max(MAX_DT, 1.5 / self.config.rate_hz))
-                motion = last.motion.follow(twist, dt, limits, self.model.kinematics, cap)
+                motion = follow(out.motion, twist, dt, limits, self.model.kinematics, cap)
                 speeds = self.model.kinematics.wheel_speeds(motion.twist)
-                if motion is last.motion:
+                if motion is out.motion:
                     self._steady = (wanted, speeds)
         else:
-            motion = last.motion.coast(since, limits, stop=mode in HALTED)
+            motion = coast(out.motion, since, limits, stop=mode in HALTED)
             speeds = self.model.kinematics.wheel_speeds(motion.twist)
-        last.speeds, last.applied = speeds, motion.twist
-        line = state.session.line(self.link_setup, now_ns, speeds)
-        if line is not None:
-            last.waiting = (motion, speeds)
+        last.motion, last.speeds = motion, speeds
+        line = state.session.line(self.link_setup, out, now_ns, speeds)
+        last.waits = line is not None
         return line
 
-    def sent(self, left_ns: Ns, line: bytes | None, trip: Trip = "") -> None:
+    def sent(self, at_ns: Ns, line: bytes | None, trip: Trip = "") -> None:
         """Record what left of the line of `drive`, and when: nothing, if `line` is None.
 
         `trip` says why the guard replaced it with the stop line.
         """
-        state = self.state
-        left = line is not None
-        if trip or not left:
+        state, last, session = self.state, self.state.last, self.state.session
+        last.waits, last.trip = False, trip
+        if trip or line is None:
             self._calm_until_ns = 0
-        # The question moves nothing: a ramp continues from the line before it.
-        state.last.sent(left and line != QUESTION_LINE, trip)
-        # The board must not be expected to answer a line that the guard has replaced.
-        state.session.sent(self.link_setup, left_ns, was_written=left and not trip)
-        if left:
-            state.count("lines_sent")
-        elif state.session.link != "down":
-            state.count("lines_superseded")
+        if line is None:
+            closed = session.link == "down"
+            state.out.dropped(last.made_ns, closed=closed, trip=bool(trip))
+            if not closed:
+                state.count("lines_superseded")
+            return
+        state.count("lines_sent")
+        motion, speeds = (AT_REST, STILL) if trip else (last.motion, last.speeds)
+        silent, is_robots = session.silent(last.made_ns), not trip
+        state.out.wrote(
+            self.link_setup, line, at_ns, last.made_ns, motion, speeds,
+            silent=silent, is_robots=is_robots,
+        )  # fmt: skip
+        if line == QUESTION_LINE:
+            session.asks(at_ns)
 
     # Feedback.
 
@@ -321,7 +330,7 @@ class Robot:
         state = self.state
         session, before = state.session, state.status.link
         feedback = session.update(
-            self.link_setup, now, heard.port_open, heard.opened, heard.received
+            self.link_setup, state.out, now, heard.port_open, heard.opened, heard.received
         )
         link, inputs = session.link, state.inputs
         sent = state.counters.get("lines_sent", 0)
@@ -356,7 +365,7 @@ class Robot:
         if link != "up":
             # Without a link the daemon cannot ramp, so set the speeds to zero at once. When the
             # link returns, a command from before the loss is too old to follow.
-            state.last.cut()
+            state.cut()
             state.life.link(up=False)
             if link == "down" and before != "down":
                 state.arbiter.require_neutral(now.mono_ns)
@@ -394,7 +403,8 @@ class Robot:
                 state.arbiter.require_neutral(now_ns)
         if estop.pressed_now is not None or bumpers.pressed_now is not None:
             # Do not ramp: the hardware has cut the motors, or the robot touches an obstacle.
-            state.last.press(now_ns)
+            state.cut()
+            state.last.made_of, state.last.pressed_ns = None, now_ns
         if estop.driver_fault:
             self._fault(DRIVER_FAULT_REASON, now, events)
             life.freed_ns = now_ns
@@ -460,7 +470,7 @@ class Robot:
         # do not follow the commanded speeds are not a sign of a fault.
         estop = state.inputs.estop
         pressed = estop.is_pressed or estop.pressed_now is not None
-        wheels.commanded = None if pressed else state.last.written
+        wheels.commanded = None if pressed else state.out.speeds
         wheels.late = state.session.steps.step_s > WRITE_PAUSE_S
         estimate = state.odometry.fold(line, checks, self.model)
         if wheels.fault is not None:
@@ -561,7 +571,7 @@ class Robot:
     def _at_rest(self) -> bool:
         # Two lines are zero: the last one that left, which the wheels follow, and the last one that
         # was computed.
-        return self.speeds == STILL and self.state.last.motion.twist == REST
+        return self.speeds == STILL and self.state.out.motion.twist == REST
 
     def _rolls(self, now_ns: Ns) -> bool:
         state = self.state

@@ -11,6 +11,7 @@ from msgspec import Struct, field
 from acsard.core.board_inputs import BoardInputs, inputs_after
 from acsard.core.config.settings import Config
 from acsard.core.link.link_diagnosis import UnansweredLines
+from acsard.core.link.output import Output
 from acsard.core.link.session import McuSession
 from acsard.core.motion.arbiter import Arbiter, Choice
 from acsard.core.motion.arbiter_text import CommandEvents
@@ -21,7 +22,7 @@ from acsard.core.motion.lifecycle import Lifecycle
 from acsard.core.motion.odometry import Odometry
 from acsard.core.motion.sanity import Sanity
 from acsard.core.motion.uncertainty import ErrorModel
-from acsard.core.values import Event, Latches, Ns, SpeedCap, Status
+from acsard.core.values import AT_REST, STILL, Event, Latches, Ns, SpeedCap, Status
 
 
 class State(Struct):
@@ -30,6 +31,7 @@ class State(Struct):
     last: LastLine
     inputs: BoardInputs
     odometry: Odometry
+    out: Output = field(default_factory=Output)
     session: McuSession = field(default_factory=McuSession)
     checks: ConsistencyChecks = field(default_factory=ConsistencyChecks)
     sanity: Sanity = field(default_factory=Sanity)
@@ -51,6 +53,10 @@ class State(Struct):
 
     def count(self, name: str, more: int = 1) -> None:
         self.counters[name] = self.counters.get(name, 0) + more
+
+    def cut(self) -> None:
+        """Set the speed to zero without a ramp: the motors have stopped."""
+        self.last.speeds, self.out.motion = STILL, AT_REST
 
 
 def initial(latches: Latches, config: Config, model: ErrorModel) -> State:

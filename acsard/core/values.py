@@ -62,6 +62,14 @@ class Twist(Struct, frozen=True, gc=False):
     angular: float = 0.0
 
 
+class Motion(Struct, frozen=True):
+    """An allowed twist, and the acceleration of each axis that led to it."""
+
+    twist: Twist = Twist()
+    linear_slope: float = 0.0
+    angular_slope: float = 0.0
+
+
 class Pose(Struct, frozen=True, gc=False):
     """Planar pose of base_link in the frame odom, m and rad, with the yaw from -pi to pi."""
 
@@ -85,6 +93,7 @@ class WheelSpeeds(Struct, frozen=True, gc=False):
 
 REST = Twist()
 STILL = WheelSpeeds()
+AT_REST = Motion()  # without a ramp, if it replaces another motion
 
 
 class PoseCovariance(Struct, frozen=True, gc=False):

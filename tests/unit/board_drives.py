@@ -19,8 +19,9 @@ from msgspec import Struct
 from acsard.core.config.settings import McuConfig
 from acsard.core.link.feedback import Feedback
 from acsard.core.link.link_setup import LinkSetup
+from acsard.core.link.output import QUESTION_LINE, Output
 from acsard.core.link.session import McuSession
-from acsard.core.values import NS_PER_S, Instant, Pose, Received, WheelSpeeds
+from acsard.core.values import AT_REST, NS_PER_S, Instant, Pose, Received, WheelSpeeds
 from tests.unit.odometer import Odometer, arc
 
 RATE, PERIOD = 100.0, 0.01
@@ -103,7 +104,7 @@ class Host:
             encoder_counts=case.counts,
             link_check="on" if case.checked else "off",
         )
-        self.setup, self.session = LinkSetup.of(mcu, RATE), McuSession()
+        self.setup, self.session, self.out = LinkSetup.of(mcu, RATE), McuSession(), Output()
         self.found, self.counted = Odometer(counts=case.counts), Pose()
         self.made: list[float] = []
         self.heard: list[Feedback] = []
@@ -191,8 +192,13 @@ class Host:
         self.now = at
         now = _instant(at)
         self._update(now, ())
-        line = self.session.line(self.setup, now.mono_ns, ROLLING)
-        self.session.sent(self.setup, now.mono_ns, was_written=True)
+        session, out, now_ns = self.session, self.out, now.mono_ns
+        line = session.line(self.setup, out, now_ns, ROLLING)
+        if line is not None:
+            silent = session.silent(now_ns)
+            out.wrote(self.setup, line, now_ns, now_ns, AT_REST, ROLLING, silent=silent)
+        if line == QUESTION_LINE:
+            session.asks(now_ns)
         return line
 
     def read(self, arrivals: deque[tuple[float, bytes]], tick: float) -> None:
@@ -210,7 +216,7 @@ class Host:
 
     def _update(self, now: Instant, received: tuple[Received, ...]) -> None:
         self.session.steps.begin(now.mono_ns)
-        for feedback in self.session.update(self.setup, now, True, 1, received):
+        for feedback in self.session.update(self.setup, self.out, now, True, 1, received):
             self.heard.append(feedback)
             self.found.fold(feedback)
 

@@ -8,8 +8,9 @@ from acsard.core.link.checked_line import seal
 from acsard.core.link.feedback import Feedback
 from acsard.core.link.link_setup import LinkSetup
 from acsard.core.link.link_state import GOOD_LINES
-from acsard.core.link.session import QUESTION_LINE, McuSession
-from acsard.core.values import NS_PER_S, Instant, Received, WheelSpeeds
+from acsard.core.link.output import QUESTION_LINE, Output
+from acsard.core.link.session import McuSession
+from acsard.core.values import AT_REST, NS_PER_S, Instant, Received, WheelSpeeds
 from tests.vectors.lines import SEED_LINE, ZERO
 
 MS = 1_000_000
@@ -23,7 +24,8 @@ SLOW = WheelSpeeds(1.0, 1.0, 1.0, 1.0)
 class LinkBench:
     def __init__(self, mcu: McuConfig = PLAIN, longest_reply: float = 0.25) -> None:
         self.setup = LinkSetup.of(mcu, 100.0, longest_reply=longest_reply)
-        self.session = McuSession()
+        self.session, self.out = McuSession(), Output()
+        self.made: bytes | None = None  # the line that waits for the port
         self.now_ns = self.made_ns = 1000 * MS
         self.opened, self.port_open = 0, False
 
@@ -46,7 +48,8 @@ class LinkBench:
 
     def line(self, speeds: WheelSpeeds = SLOW) -> bytes | None:
         self.made_ns = self.now_ns
-        return self.session.line(self.setup, self.now_ns, speeds)
+        self.made = self.session.line(self.setup, self.out, self.now_ns, speeds)
+        return self.made
 
     def answer(self, line: bytes | None) -> bytes:
         """Return the checked reply to a line from the host."""
@@ -60,9 +63,22 @@ class LinkBench:
         """
         self.now_ns += int(ms * MS)
         received = tuple(Received(self.now, data) for data in reads)
-        self.session.sent(self.setup, self.made_ns, was_written=left)
+        if self.made is not None:
+            self._report(self.made, left)
         self.session.steps.begin(self.now_ns)
-        return self.session.update(self.setup, self.now, self.port_open, self.opened, received)
+        return self.session.update(
+            self.setup, self.out, self.now, self.port_open, self.opened, received
+        )
+
+    def _report(self, line: bytes, left: bool) -> None:
+        session, made_ns, self.made = self.session, self.made_ns, None
+        if not left:
+            self.out.dropped(made_ns, closed=session.link == "down", trip=False)
+            return
+        silent = session.silent(made_ns)
+        self.out.wrote(self.setup, line, made_ns, made_ns, AT_REST, SLOW, silent=silent)
+        if line == QUESTION_LINE:
+            session.asks(made_ns)
 
     def wait(self, ms: float, *reads: bytes) -> list[Feedback]:
         """Update the session after `ms`.
@@ -70,9 +86,9 @@ class LinkBench:
         Before that, the stop and the question with which a session begins leave the port.
         """
         session = self.session
-        if session._made is None and self.port_open and (session._first or session._echo.due):
+        if self.made is None and self.port_open and (not self.out.lines or session._echo.due):
             self.line()
-        if session._made is not None and session._made[0] == QUESTION_LINE:
+        if self.made == QUESTION_LINE:
             reads = BOOTED, *reads
         return self.update(True, ms, *reads)
 

@@ -14,9 +14,9 @@ from msgspec import Struct
 
 from acsard.core.config.settings import DriveConfig, FeedbackConfig, LimitsConfig
 from acsard.core.motion.kinematics import Kinematics
-from acsard.core.motion.limits import Motion
+from acsard.core.motion.limits import follow
 from acsard.core.motion.wheels import Wheels, count_angle, new_wheels
-from acsard.core.values import WHEELS, Twist, WheelSpeeds
+from acsard.core.values import WHEELS, Motion, Twist, WheelSpeeds
 
 Kind = Literal["reversed", "runaway", "dead", "stuck", "swapped", "too fast", "too slow"]
 
@@ -118,7 +118,7 @@ class Bench:
     def step(self, wished: Twist) -> None:
         dt = 1.0 / self.robot.rate
         self.now += dt
-        self.motion = self.motion.follow(wished, dt, self.limits, self.kinematics, self.cap)
+        self.motion = follow(self.motion, wished, dt, self.limits, self.kinematics, self.cap)
         commanded = self.kinematics.wheel_speeds(self.motion.twist)
         goals = list(commanded.as_tuple())
         for i, j in self.swaps:

@@ -12,8 +12,8 @@ from msgspec.structs import replace
 
 from acsard.core.config.settings import DriveConfig, LimitsConfig
 from acsard.core.motion.kinematics import Kinematics
-from acsard.core.motion.limits import AT_REST
-from acsard.core.values import REST, Twist
+from acsard.core.motion.limits import coast, follow
+from acsard.core.values import AT_REST, REST, Twist
 from tests.each import each
 
 law = settings(max_examples=100)
@@ -82,7 +82,7 @@ class Ramp:
         return max(map(abs, self.kinematics.wheel_speeds(self.twist).as_tuple()))
 
     def follow(self, wish: Twist, dt: float = DT) -> Twist:
-        self.motion = self.motion.follow(wish, dt, self.limits, self.kinematics, self.cap)
+        self.motion = follow(self.motion, wish, dt, self.limits, self.kinematics, self.cap)
         return self.twist
 
     def path(self, wish: Twist, steps: int, dt: float = DT) -> list[Twist]:
@@ -92,7 +92,7 @@ class Ramp:
         return [twist.linear for twist in self.path(Twist(wish), steps)]
 
     def coast(self, dt: float = DT, stop: bool = False) -> Twist:
-        self.motion = self.motion.coast(dt, self.limits, stop)
+        self.motion = coast(self.motion, dt, self.limits, stop)
         return self.twist
 
 

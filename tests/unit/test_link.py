@@ -9,6 +9,7 @@ from acsard.core.config.wire_time import wire_ns
 from acsard.core.link.feedback import MIN_INTERVAL_NS
 from acsard.core.link.link_setup import LinkSetup
 from acsard.core.link.link_state import Link
+from acsard.core.link.output import Output
 from acsard.core.link.session import LONG_GAP_NS, McuSession
 from acsard.core.values import NS_PER_S, Instant, Received, WheelSpeeds
 from tests.each import each
@@ -147,10 +148,10 @@ def test_a_line_is_never_older_than_the_previous_line() -> None:
 
 
 def test_a_step_of_the_wall_clock_changes_no_dt() -> None:
-    setup, session = LinkSetup.of(FREE, 100.0), McuSession()
+    setup, session, out = LinkSetup.of(FREE, 100.0), McuSession(), Output()
     for step in range(1, 10):
         now = Instant(step * 10 * MS, WALL_NS + (-1) ** step * 3600 * NS_PER_S)
-        (feedback,) = session.update(setup, now, True, 1, (Received(now, GOOD),))
+        (feedback,) = session.update(setup, out, now, True, 1, (Received(now, GOOD),))
         assert feedback.dt == (0.01 if step > 1 else 0.0)
         late_ns = now.mono_ns - feedback.at.mono_ns
         assert late_ns == now.wall_ns - feedback.at.wall_ns == wire_ns(len(GOOD), 115200)

@@ -12,7 +12,8 @@ from acsard.core.config.settings import FeedbackConfig, McuConfig, WheelMap
 from acsard.core.link.checked_line import Reading
 from acsard.core.link.feedback import Feedback, Timeline
 from acsard.core.link.link_setup import LinkSetup
-from acsard.core.values import Instant, WheelSpeeds
+from acsard.core.link.output import Output
+from acsard.core.values import AT_REST, Instant, WheelSpeeds
 from tests.each import each
 
 MS = 1_000_000
@@ -34,7 +35,7 @@ class Bench:
         check: Literal["off", "on"] = "on" if counts and not period else "off"
         mcu = McuConfig(wheels=wheels, encoder_counts=counts, link_check=check, reply_period=period)
         self.setup = LinkSetup.of(mcu, 100.0, FeedbackConfig(wheel_speed=80.0))
-        self.timeline = Timeline()
+        self.timeline, self.out = Timeline(), Output()
         self.now_ns, self.mcu_ms = 9000 * MS, 500
 
     def line(
@@ -65,18 +66,19 @@ class Bench:
         """Read this many lines at once, `ms` later. With `gap`, the first one follows a silence."""
         self.now_ns += int(ms * MS)
         at = Instant(self.now_ns, self.now_ns + 7)
-        self.timeline.process_read(self.setup, at, LENGTH * lines, lines, 0)
+        self.timeline.process_read(self.setup, self.out, at, LENGTH * lines, lines, 0)
         return [
             self.timeline.place(
-                self.setup, SPEEDS, reading, LENGTH * left, LENGTH, gap and left == lines - 1,
-                asked_ns,
+                self.setup, self.out, SPEEDS, reading, LENGTH * behind, LENGTH,
+                gap and behind == lines - 1, asked_ns,
             )
-            for left in reversed(range(lines))
+            for behind in reversed(range(lines))
         ]  # fmt: skip
 
     def sends(self, ms: float) -> None:
         """Let a line leave `ms` from now."""
-        self.timeline.written(self.setup, self.now_ns + int(ms * MS))
+        at_ns, line = self.now_ns + int(ms * MS), self.setup.codec.encode(SPEEDS)
+        self.out.wrote(self.setup, line, at_ns, at_ns, AT_REST, SPEEDS, silent=False)
 
     def answered(
         self, sent_ms: float, came_ms: float, *lost: float, gap: bool = False

@@ -23,8 +23,8 @@ from acsard.core.config.settings import (
     McuConfig,
 )
 from acsard.core.motion.kinematics import Kinematics
-from acsard.core.motion.limits import AT_REST
-from acsard.core.values import REST, Twist
+from acsard.core.motion.limits import coast, follow
+from acsard.core.values import AT_REST, REST, Twist
 
 DT = 0.01
 
@@ -119,10 +119,10 @@ def test_every_accepted_robot_comes_to_rest_in_time_from_any_reachable_speed(
         config = mended(config, lines[0]) if lines else config
     motion, wish = AT_REST, Twist(way[0] * 10.0, way[1] * 50.0)
     for _ in range(20):
-        motion = motion.follow(wish, 10.0, config.limits, Kinematics(config.drive))
+        motion = follow(motion, wish, 10.0, config.limits, Kinematics(config.drive))
     longest = MAX_STOP_S if stop else MAX_RAMP_S
     for _ in range(round(longest / DT) + 1):
-        motion = motion.coast(DT, config.limits, stop)
+        motion = coast(motion, DT, config.limits, stop)
     assert motion.twist == REST
 
 

@@ -17,18 +17,10 @@ import struct
 from msgspec import Struct
 
 from acsard.core.link.codec import FrameError
-from acsard.core.link.link_state import WATCHDOG_NS
-from acsard.core.values import Ns
 
 SEQUENCES = 256  # the number after 255 is 0
 
 SAMPLE_REQUEST = b"S"  # asks for the sample fields
-
-# That wait for an answer, far below 256 numbers: no reply can match the wrong line.
-MAX_OPEN_LINES = 64
-
-# A later reply is rejected: a board that got no other line has stopped the motors by then.
-ANSWER_TIMEOUT_NS = WATCHDOG_NS
 
 # The pattern also restricts the characters of the plain part, because the CRC does not detect zero
 # bytes in front of a line.
@@ -77,45 +69,3 @@ def unseal(line: bytes) -> Checked:
 def _reading(sample: bytes) -> Reading:
     mcu_ms, a, b, c, d = _SAMPLE.unpack(binascii.unhexlify(sample))
     return Reading(mcu_ms, (a, b, c, d))
-
-
-class OpenLines(Struct):
-    """Numbers the checked lines, and finds the line that a reply answers."""
-
-    sequence: int = 0  # of the last line
-    waiting: list[tuple[int, Ns]] = []  # numbers and times of lines without an answer
-    # Numbers of the last lines that were answered: a hub or a repeater may send a reply twice.
-    last: list[int] = []
-
-    def forget(self) -> None:
-        self.waiting.clear()
-
-    def next_number(self) -> int:
-        self.sequence = (self.sequence + 1) % SEQUENCES
-        return self.sequence
-
-    def written(self, at_ns: Ns) -> None:
-        """Record that the line with the last number was written."""
-        self.waiting.append((self.sequence, at_ns))
-        if len(self.waiting) > MAX_OPEN_LINES:
-            del self.waiting[0]
-
-    def answered(self, reply: Checked, at_ns: Ns) -> Ns:
-        """Return when the line that a correct reply answers was written.
-
-        Raises `FrameError` if no line of the last `ANSWER_TIMEOUT_NS` has its number; "repeated" if
-        the line was answered before, which is no damage.
-        """
-        waiting = self.waiting
-        while waiting and at_ns - waiting[0][1] > ANSWER_TIMEOUT_NS:
-            waiting.pop(0)
-        if reply.sequence not in [sequence for sequence, _ in waiting]:
-            again = reply.sequence in self.last
-            raise FrameError("repeated" if again else "stale_sequence", reply.plain)
-        # The board answers in order, so earlier lines get no more answers.
-        sequence, written_ns = waiting.pop(0)
-        while sequence != reply.sequence:
-            sequence, written_ns = waiting.pop(0)
-        self.last.append(sequence)
-        del self.last[:-MAX_OPEN_LINES]
-        return written_ns

@@ -21,8 +21,6 @@ ANSWER_NS = NS_PER_S // 2  # a later `QUESTION` or name has another cause
 
 REPEATED_NS = NS_PER_S // 50  # a name so soon after another one: no board boots in between
 
-COMPARED_LINES = 8  # newest written lines: at 100 Hz, an echo within 70 ms is noticed
-
 WINDOW_NS = NS_PER_S // 2
 
 # Of the written lines that return: an echo beside a board's replies, of which some get lost.
@@ -38,20 +36,19 @@ _NO_SPEED = b"abcdpn0.,"  # of these bytes is the line of zeros
 
 
 class EchoCheck(Struct):
-    """What was written and received since the port was opened."""
+    """What was received since the port was opened, compared with the lines that were written."""
 
     trouble: Literal["", "echo", "set_points"] = ""  # until the next opening
     due: bool = False  # the question
     asked: bool = False  # in this session
     asked_ns: Ns | None = None
     named_ns: Ns | None = None  # a board has last sent its name since the question
-    sent: list[bytes] = []  # newest lines, with their ends
     speeds: bytes = b""  # of the last repeated line
     windows: int = 0  # in a row, of repeated lines with other speeds
     steady: bool = False  # the last window had repeated lines of a moving robot
-    # The window: its begin, and the lines in it.
+    # The window: its begin, the number of lines that were written before it, and the lines in it.
     since_ns: Ns = 0
-    written_lines: int = 0
+    written: int = 0
     lines: int = 0  # received
     repeated: int = 0
     changes: int = 0  # of their speeds
@@ -60,26 +57,20 @@ class EchoCheck(Struct):
         """Ask again after the next line, because a new session begins."""
         self.due = self.asked = False
 
-    def _begin(self, now_ns: Ns) -> None:
-        self.since_ns = now_ns
-        self.written_lines = self.lines = self.repeated = self.changes = 0
+    def _begin(self, now_ns: Ns, written: int) -> None:
+        self.since_ns, self.written = now_ns, written
+        self.lines = self.repeated = self.changes = 0
 
     def asks(self, at_ns: Ns) -> None:
         """Record that `QUESTION` was written."""
         self.asked_ns, self.due, self.asked, self.named_ns = at_ns, False, True, None
 
-    def written(self, line: bytes) -> None:
-        sent = self.sent
-        sent.append(line)
-        if len(sent) > COMPARED_LINES:
-            del sent[0]
-        self.written_lines += 1
-
-    def received(self, line: bytes) -> None:
+    def received(self, line: bytes, written: list[bytes]) -> None:
+        """Compare a received line with the newest `written` ones."""
         if not self.asked:
             self.due = True  # not before: a board that boots would not get it
         self.lines += 1
-        if line + b"\r\n" in self.sent:
+        if line + b"\r\n" in written:
             self.repeated += 1
             speeds, self.speeds = self.speeds, line[:_SPEEDS]
             self.changes += bool(speeds) and speeds != self.speeds
@@ -102,15 +93,17 @@ class EchoCheck(Struct):
     def _answers(self, at_ns: Ns) -> bool:
         return self.asked_ns is not None and at_ns - self.asked_ns <= ANSWER_NS
 
-    def end_window(self, now_ns: Ns, moving: bool, encoders: bool) -> None:
+    def end_window(self, now_ns: Ns, written: int, moving: bool, encoders: bool) -> None:
         """Ask, or find a board without encoders, `WINDOW_NS` or more after the window began.
 
-        If `moving`, repeated zeros are no reason, and an equal speed is one only at first: a motor
-        may be that steady. `encoders` is `feedback.encoders`.
+        `written` lines left since the opening. If `moving`, repeated zeros are no reason, and an
+        equal speed is one only at first: a motor may be that steady. `encoders` is
+        `feedback.encoders`.
         """
-        least, changes = min(self.lines, RETURNED_FRACTION * self.written_lines), self.changes
+        least = min(self.lines, RETURNED_FRACTION * (written - self.written))
+        changes = self.changes
         suspect = 0 < least <= self.repeated
-        self._begin(now_ns)
+        self._begin(now_ns, written)
         known, self.steady = self.steady, suspect and bool(self.speeds.strip(_NO_SPEED))
         if not suspect:
             self.windows = 0

@@ -15,7 +15,7 @@ from acsard.core.link.checked_line import Reading
 from acsard.core.link.codec import Motors
 from acsard.core.link.line_times import FreeRunning, Prompted
 from acsard.core.link.link_setup import LinkSetup
-from acsard.core.link.link_state import WATCHDOG_NS
+from acsard.core.link.output import Output
 from acsard.core.values import NS_PER_S, Instant, Ns, WheelSpeeds
 
 # Only shorter gaps are filled: the board may have been reset in a longer one.
@@ -74,28 +74,21 @@ class Timeline(Struct):
     read_lines: int = 0
     heard_ns: Ns = 0  # the last line was complete
     last: Instant | None = None  # sample time of the last line
-    rest_ns: Ns = 0  # the last command to move ended: zeros, or the board's watchdog
     counts_check: CountsCheck = field(default_factory=CountsCheck)
     gaps: int = 0  # lines behind lost ones
     leaps: int = 0  # lines with impossible counts, for which speed times time is used
     restarted: bool = False  # by the board's clock in the last line
 
     def forget(self) -> None:
-        """Forget the lines and commands before: the board may be another one."""
+        """Forget the lines before: the board may be another one."""
         self.free_running = FreeRunning()
         self.prompted = Prompted()
         self.encoders.forget()
         self.counts_check = CountsCheck()
         self.begun = False
 
-    def written(self, setup: LinkSetup, at_ns: Ns, moves: bool = True) -> None:
-        """Record a command that was written; `moves` if a speed in it is not zero."""
-        if not setup.period_ns:
-            self.prompted.written(at_ns)
-        self.rest_ns = at_ns + WATCHDOG_NS if moves else min(self.rest_ns, at_ns)
-
     def process_read(
-        self, setup: LinkSetup, at: Instant, size: int, lines: int, following: int
+        self, setup: LinkSetup, out: Output, at: Instant, size: int, lines: int, following: int
     ) -> None:
         """Process a read that completes `lines`, with `following` bytes after them."""
         before, end_ns = self.end_ns, at.mono_ns
@@ -108,19 +101,20 @@ class Timeline(Struct):
             since = end_ns - before
             self.free_running.process_read(end_ns, since, lines, drained, setup.period_ns)
         elif not setup.mcu.checked:
-            self.prompted.process_read(end_ns, lines, setup.soonest_ns, setup.apart_ns)
+            self.prompted.process_read(out, end_ns, lines, setup.soonest_ns, setup.apart_ns)
 
-    def skip_bad(self, setup: LinkSetup) -> None:
+    def skip_bad(self, setup: LinkSetup, out: Output) -> None:
         """Skip a line that is not used, and the command that it may answer, or its period."""
         self.rest -= 1
         if setup.period_ns:
             self.free_running.skip()
         elif not setup.mcu.checked:  # else the next reply names its command
-            self.prompted.give_up()
+            out.give_up()
 
     def place(
         self,
         setup: LinkSetup,
+        out: Output,
         speeds: WheelSpeeds,
         reading: Reading | None,
         following: int,
@@ -145,7 +139,7 @@ class Timeline(Struct):
         else:
             if asked_ns is not None and not self.rest:
                 self.prompted.measure(self.end_ns - asked_ns, self.read_lines, setup.apart_ns)
-            placed = self.prompted.place(self.end_ns, asked_ns, setup.apart_ns)
+            placed = self.prompted.place(out, self.end_ns, asked_ns, setup.apart_ns)
         dt, bridged, gap = placed.dt_ns / NS_PER_S, placed.bridged_ns / NS_PER_S, 0.0
         known, turned, doubt, self.restarted = self.begun, None, None, False
         if bridged > 0.0:
@@ -182,7 +176,7 @@ class Timeline(Struct):
             None,
             NO_STEPS,
             0.0,
-            0.0 if last is None else (self.rest_ns - last.mono_ns) / NS_PER_S,
+            0.0 if last is None else (out.rest_ns - last.mono_ns) / NS_PER_S,
             placed.jitter_ns / NS_PER_S,
             doubt,
         )

@@ -15,6 +15,7 @@ import math
 
 from msgspec import Struct, field
 
+from acsard.core.link.output import Output
 from acsard.core.values import NS_PER_S, Ns
 
 MAX_CLOCK_ERROR = 0.01  # relative; a ceramic resonator reaches half of it
@@ -45,8 +46,6 @@ WINDOW_NS = NS_PER_S // 2  # of the least delay of a free-running board
 # Missing lines among the last `LOSSY_LINES`. Above it, the link of a free-running board behind an
 # adapter that holds lines back is lossy: nobody knows between which lines they are missing.
 LOSSY, LOSSY_LINES = 2.0, 1000
-
-MAX_OPEN_COMMANDS = 64  # replies to them may still come
 
 LEAST_DELAY_GAIN = 0.002  # rise of the least delay per reply: an old one is forgotten after 500
 
@@ -173,95 +172,82 @@ class FreeRunning(Struct):
 class Prompted(Struct):
     """The lines of a board that answers commands, in their order."""
 
-    left: list[Ns] = []  # commands that wait for a reply
-    newest: Ns = 0  # last one that was written
-    given_up: list[Ns] = []  # older ones, newest last; the reply may still come
-    answered: Ns = 0  # last one
+    answered: Ns = 0  # the last command
     sample_ns: Ns = 0  # of the last line, as the time of a command
     least: float = 0.0  # delay of a reply, ns; 0 if unknown
     own: float = 0.0  # ns of the last read's delay that is the board's own
     jitter: float = 0.0  # ns that the delay varies, without the board's own
     lateness: Lateness = field(default_factory=Lateness)
 
-    def written(self, at_ns: Ns) -> None:
-        self.newest = at_ns
-        self.left.append(at_ns)
-        if len(self.left) > MAX_OPEN_COMMANDS:
-            self.give_up()
-
-    def give_up(self) -> None:
-        """Give up the oldest command: its reply is damaged, or does not come."""
-        if self.left:
-            self.given_up.append(self.left.pop(0))
-            del self.given_up[:-MAX_OPEN_COMMANDS]
-
-    def process_read(self, end_ns: Ns, lines: int, soonest: Ns, apart: Ns) -> None:
-        """Process a read of replies that do not name their commands, which are `apart`."""
-        left, given_up, lateness, last = self.left, self.given_up, self.lateness, lines - 1
+    def process_read(self, out: Output, end_ns: Ns, lines: int, soonest: Ns, period: Ns) -> None:
+        """Process a read of replies that do not name their commands, one in each `period`."""
+        waiting, given_up, lateness, last = out.open, out.given_up, self.lateness, lines - 1
         self.own = 0.0
-        if lines == 1 and len(left) == 1 and self.least and not given_up:
-            self.measure(end_ns - left[0], 1, apart)  # it answers the only command that waits
+        if lines == 1 and len(waiting) == 1 and self.least and not given_up:
+            self.measure(end_ns - waiting[0].at_ns, 1, period)  # it answers the only command
             return
-        while given_up and len(left) < lines:
-            left.insert(0, given_up.pop())
-        if len(left) < lines:
+        while given_up and len(waiting) < lines:
+            out.take_back()
+        if len(waiting) < lines:
             return
         if not self.least:
             # The first reply answers the newest command that it can answer.
-            while len(left) > lines and end_ns - left[lines] >= soonest:
-                self.give_up()
-            self.least = float(max(soonest, end_ns - left[last]))
-        late = (end_ns - left[last] - self.least) / apart
-        while given_up and (late < -EARLY_REPLY or end_ns - left[last] < soonest):
-            left.insert(0, given_up.pop())
-            late = (end_ns - left[last] - self.least) / apart
+            while len(waiting) > lines and end_ns - waiting[lines].at_ns >= soonest:
+                out.give_up()
+            self.least = float(max(soonest, end_ns - waiting[last].at_ns))
+        late = (end_ns - waiting[last].at_ns - self.least) / period
+        while given_up and (late < -EARLY_REPLY or end_ns - waiting[last].at_ns < soonest):
+            out.take_back()
+            late = (end_ns - waiting[last].at_ns - self.least) / period
         possible = end_ns - max(self.least - USB_JITTER_NS, soonest)
         while (
-            len(left) > lines and left[lines] <= possible and lateness.missing(late, lines, apart)
+            len(waiting) > lines
+            and waiting[lines].at_ns <= possible
+            and lateness.missing(late, lines, period)
         ):
-            self.give_up()
-            late = (end_ns - left[last] - self.least) / apart
-        self.measure(end_ns - left[last], lines, apart)
+            out.give_up()
+            late = (end_ns - waiting[last].at_ns - self.least) / period
+        self.measure(end_ns - waiting[last].at_ns, lines, period)
 
-    def measure(self, delay: Ns, lines: int, apart: Ns) -> None:
+    def measure(self, delay: Ns, lines: int, period: Ns) -> None:
         """Measure the delay of the last reply of a read."""
         lateness, least = self.lateness, self.least or float(delay)
         longer = delay - least
-        late = longer / apart
+        late = longer / period
         if longer < 0.0:
             self.least = float(delay)
         else:
-            self.least = least + LEAST_DELAY_GAIN * (longer if longer < apart else apart)
+            self.least = least + LEAST_DELAY_GAIN * (longer if longer < period else period)
         off, deviation = late - lateness.usual, lateness.deviation
         lateness.follow(late)
-        jitter = deviation * apart
+        jitter = deviation * period
         narrow = deviation < NARROW_DEVIATION and USB_JITTER_NS < jitter < ADAPTER_JITTER_NS
         self.jitter = USB_JITTER_NS if narrow else jitter
         if lines == 1 and narrow and abs(off) < 4 * deviation:
-            self.own = off * apart * (1.0 - (USB_JITTER_NS / jitter) ** 2)
+            self.own = off * period * (1.0 - (USB_JITTER_NS / jitter) ** 2)
 
-    def place(self, end_ns: Ns, asked_ns: Ns | None, apart: Ns) -> Placed:
+    def place(self, out: Output, end_ns: Ns, asked_ns: Ns | None, period: Ns) -> Placed:
         """Return the time of the next reply, to the command of `asked_ns` if it says so."""
-        left, before = self.left, self.sample_ns
-        usual = self.least + self.lateness.usual * apart
+        waiting, given_up, before = out.open, out.given_up, self.sample_ns
+        usual = self.least + self.lateness.usual * period
         if asked_ns is not None:
-            while left and left[0] < asked_ns:
-                self.give_up()
-            if left and left[0] == asked_ns:
-                left.pop(0)
+            while waiting and waiting[0].at_ns < asked_ns:
+                out.give_up()
+            if waiting and waiting[0].at_ns == asked_ns:
+                waiting.pop(0)
             command = asked_ns
-        elif left:
-            command = left.pop(0)
+        elif waiting:
+            command = waiting.pop(0).at_ns
         else:
             # No command waits: this one answers none, or one that was given up.
             command = end_ns - int(usual)
-            if self.newest:
-                command = min(command, self.newest + apart)
+            if out.newest_ns:
+                command = min(command, out.newest_ns + period)
         sample_ns = command + int(self.own)
         if sample_ns < before:
             sample_ns = before
         dt_ns, bridged_ns = sample_ns - before if before else 0, 0
-        if self.given_up and before and self.given_up[-1] > self.answered:
-            bridged_ns = min(max(self.given_up[-1] - before, 0), dt_ns)
+        if given_up and before and given_up[-1].at_ns > self.answered:
+            bridged_ns = min(max(given_up[-1].at_ns - before, 0), dt_ns)
         self.answered, self.sample_ns, self.own = command, sample_ns, 0.0
         return Placed(sample_ns + int(usual), dt_ns, bridged_ns, int(self.jitter))

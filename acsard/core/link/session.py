@@ -14,7 +14,7 @@ from msgspec import Struct, field
 from acsard.core.codes import Reason, sentence
 from acsard.core.link import link_diagnosis
 from acsard.core.link.board_status import STATUS, StatusReports
-from acsard.core.link.checked_line import OpenLines, Reading, seal, unseal
+from acsard.core.link.checked_line import Reading, seal, unseal
 from acsard.core.link.codec import FrameError
 from acsard.core.link.echo_check import QUESTION, WINDOW_NS, EchoCheck
 from acsard.core.link.feedback import Feedback, Timeline
@@ -23,6 +23,7 @@ from acsard.core.link.link_diagnosis import SilenceDiagnosis
 from acsard.core.link.link_setup import LinkSetup
 from acsard.core.link.link_state import GOOD_LINES, WATCHDOG_NS, WATCHDOG_S, Link
 from acsard.core.link.link_state import State as LinkState
+from acsard.core.link.output import QUESTION_LINE, Output
 from acsard.core.link.pose_doubt import PoseDoubt
 from acsard.core.link.quantization import CountRecovery
 from acsard.core.link.step_times import StepTimes
@@ -47,8 +48,6 @@ NAMES: dict[LinkState, EventName] = {
 
 # Without a line from the board or to the port, the MCU may have been reset: a new session begins.
 LONG_GAP_NS = 1 * NS_PER_S
-
-QUESTION_LINE = QUESTION + b"\r\n"
 
 IDENTITY = b"!acsard-mcu "  # acsard's firmware, after booting and as the answer to `QUESTION`
 
@@ -82,7 +81,6 @@ class McuSession(Struct):
     count_recovery: CountRecovery = field(default_factory=CountRecovery)
     doubt: PoseDoubt = field(default_factory=PoseDoubt)
     _lines: LineReader = field(default_factory=LineReader)
-    _open_lines: OpenLines = field(default_factory=OpenLines)
     _echo: EchoCheck = field(default_factory=EchoCheck)
     _link: Link = field(default_factory=Link)
     _timeline: Timeline = field(default_factory=Timeline)
@@ -105,18 +103,10 @@ class McuSession(Struct):
     _sampled: bool = False  # the last good line had the board's counts
     _says_samples: bool = False  # a board without counts has not been reported yet
 
-    _made: tuple[bytes, Ns] | None = None  # last result of `line()`, not yet written
-    _first: bool = True  # nothing was written since the opening
-    _moved: bool = False  # the last written line moves a wheel
-    _left_ns: Ns = 0  # the port last wrote a line or was opened
-    _held_up: bool = False  # the port did not write the last line
-    _resumed: bool = False  # the port accepts lines again after `LONG_GAP_NS`
-    _blind_ns: Ns | None = None  # last stop to a silent board
-    _just_blind: bool = False
-
     def update(
         self,
         setup: LinkSetup,
+        out: Output,
         now: Instant,
         port_open: bool,
         opened: int,
@@ -126,7 +116,8 @@ class McuSession(Struct):
 
         `opened` counts the openings of the port.
         """
-        self.restarted, self._resumed = self._resumed, False
+        written = self.blocked and out.blocked_since is None
+        self.restarted = written and out.pause_ns >= LONG_GAP_NS
         self._starting_over = self.reopened = False
         if self.events:
             self.events = []
@@ -135,11 +126,11 @@ class McuSession(Struct):
         now_ns, link, echo, until_ns = now.mono_ns, self._link, self._echo, 0
         feedback: list[Feedback] = []
         if not port_open or opened != self._opened:
-            self._begin(setup, port_open, opened, now_ns)
+            self._begin(setup, out, port_open, opened, now_ns)
         if port_open:
             if received:
                 for piece in received:
-                    feedback += self._decode(setup, piece)
+                    feedback += self._decode(setup, out, piece)
                 if more := self._lines.too_long - self.rejects.get("too_long", 0):
                     self._reject("too_long", more=more)
                     link.bad(setup.checked)
@@ -158,12 +149,13 @@ class McuSession(Struct):
                 link.wait(now_ns, setup.quiet_ns)
             if (
                 link.state == "up"
-                and not (self._held_up or self.blocked or echo.trouble)
+                and out.blocked_since is None
+                and not (self.blocked or echo.trouble)
                 and self.status.up_ns is None
             ):
                 until_ns = min(link.silent_ns + 1, echo.since_ns + WINDOW_NS)
             if now_ns >= until_ns:
-                self._judge(setup, now_ns)
+                self._judge(setup, out, now_ns)
         self.until_ns = until_ns
         if feedback and (
             self.good_lines >= self.doubt.due or self._timeline.counts_check.differing
@@ -175,30 +167,23 @@ class McuSession(Struct):
             self._announce(setup)
         return feedback
 
-    def line(self, setup: LinkSetup, now_ns: Ns, speeds: WheelSpeeds) -> bytes | None:
+    def line(self, setup: LinkSetup, out: Output, now_ns: Ns, speeds: WheelSpeeds) -> bytes | None:
         """Return the line that commands `speeds`, or None if no line is due.
 
         It is a stop, whatever `speeds` is, while the board does not answer. The first of these is
         due immediately, because the board may still execute the previous line. `QUESTION` takes
         the place of a line.
         """
-        line = self._next_line(setup, now_ns, speeds)
-        self._made = None if line is None else (line, now_ns)
-        return line
-
-    def _next_line(self, setup: LinkSetup, now_ns: Ns, speeds: WheelSpeeds) -> bytes | None:
-        if self._echo.due and not self._first and (speeds != STILL or not self._moved):
+        if self._echo.due and out.lines and (speeds != STILL or not out.moves(setup)):
             return QUESTION_LINE  # but not instead of the line that stops the wheels
         if now_ns > self._link.silent_ns:
-            last_ns = self._blind_ns
-            self._just_blind = last_ns is None or now_ns - last_ns >= SILENT_BOARD_PERIOD_NS
-            if not self._just_blind:
+            if out.stop_ns is not None and now_ns - out.stop_ns < SILENT_BOARD_PERIOD_NS:
                 return None
             speeds = STILL
         line = setup.codec.stop if speeds == STILL else setup.codec.encode(speeds)
-        if not setup.checked or self._first:  # the port begins with a plain stop
+        if not setup.checked or not out.lines:  # the port begins with a plain stop
             return line
-        return seal(line, self._open_lines.next_number(), setup.letters)
+        return seal(line, out.next_number(), setup.letters)
 
     def silent(self, now_ns: Ns) -> bool:
         """Return whether the last good line of this session is older than `quiet_ns`, or missing.
@@ -231,69 +216,50 @@ class McuSession(Struct):
             return "plain"
         return "checked with samples" if self._sampled else "checked"
 
-    def sent(self, setup: LinkSetup, left_ns: Ns, *, was_written: bool) -> None:
-        """Record whether and when the last result of `line()` was written to the port."""
-        made = self._made
-        if made is None:
-            return
-        blind, self._made, self._just_blind = self._just_blind, None, False
-        line, made_ns = made
-        self._held_up = not was_written
-        if blind and (was_written or self.link == "down"):
-            self._blind_ns = made_ns
-        if not was_written:
-            return
-        self._resumed = self.blocked and left_ns - self._left_ns >= LONG_GAP_NS
-        self._left_ns, self._first = left_ns, False
-        if line == QUESTION_LINE:
-            self._echo.asks(left_ns)
-            self._blind_ns = None
-            self._link.reset_good_lines()
-            return
-        self._echo.written(line)
-        if b"#" in line:
-            self._open_lines.written(left_ns)
-        self._moved = not line.startswith(setup.rest)
-        self._timeline.written(setup, left_ns, moves=self._moved)
+    def asks(self, at_ns: Ns) -> None:
+        """Wait for the answer to the question, and count no line before it."""
+        self._echo.asks(at_ns)
+        self._link.reset_good_lines()
 
     # sessions
 
-    def _begin(self, setup: LinkSetup, port_open: bool, opened: int, now_ns: Ns) -> None:
+    def _begin(
+        self, setup: LinkSetup, out: Output, port_open: bool, opened: int, now_ns: Ns
+    ) -> None:
         self._link.apply("opened" if port_open else "closed")
         self.link = self._link.state
         self.restarted = self.reopened = opened != self._opened
         if self.reopened:
             self.status.reopen()
         self._opened = opened
-        self._left_ns, self._held_up, self.blocked = now_ns, False, False
-        if port_open:
-            self._blind_ns = None
+        self.blocked = False
+        out.reopen(now_ns, port_open)
         self._lines.clear()
         self._hearing.forget()
         self._echo = EchoCheck()
         self._plain_lines, self._unchecked = 0, False
-        self._first, self._says_samples = True, setup.mcu.wants_samples
-        self._start_over()
+        self._says_samples = setup.mcu.wants_samples
+        self._start_over(out)
 
-    def _restart(self, how: str) -> None:
+    def _restart(self, out: Output, how: str) -> None:
         # `how` completes "the microcontroller ...".
         if self._link.state == "up":
             self.events.append(Event("mcu_restarted", f"the microcontroller {how}", "warning"))
         self._link.apply("restarted")
         self.restarted = self._starting_over = True
-        self._start_over()
+        self._start_over(out)
 
-    def _start_over(self) -> None:
+    def _start_over(self, out: Output) -> None:
         self._timeline.forget()
         self.count_recovery.forget()
-        self._open_lines.forget()
+        out.restart()
         self._echo.restart()
 
-    def _judge(self, setup: LinkSetup, now_ns: Ns) -> None:
-        link = self._link
-        if not self._held_up:
+    def _judge(self, setup: LinkSetup, out: Output, now_ns: Ns) -> None:
+        link, since_ns = self._link, out.blocked_since
+        if since_ns is None:
             self.blocked = False
-        elif now_ns - self._left_ns > WATCHDOG_NS and not self.steps.step_s:
+        elif now_ns - since_ns > WATCHDOG_NS and not self.steps.step_s:
             # In a late step, the last written line is old because this computer did not run.
             self.blocked = True
         if self.blocked:
@@ -301,7 +267,7 @@ class McuSession(Struct):
         # The arbiter must see a lost link first.
         echo, was_up = self._echo, link.state == "up"
         if now_ns - echo.since_ns >= WINDOW_NS:
-            echo.end_window(now_ns, moving=was_up, encoders=setup.encoders)
+            echo.end_window(now_ns, out.count, moving=was_up, encoders=setup.encoders)
         if echo.trouble:
             link.apply("repeated")
         held = self._starting_over or not echo.asked or echo.trouble
@@ -359,23 +325,23 @@ class McuSession(Struct):
 
     # lines
 
-    def _decode(self, setup: LinkSetup, piece: Received) -> list[Feedback]:
+    def _decode(self, setup: LinkSetup, out: Output, piece: Received) -> list[Feedback]:
         lines, timeline, feedback = self._lines.feed(piece.data), self._timeline, []
         link, data = self._link, piece.data
         for line, _ in lines:
             if line.startswith(REMARKS):
-                lines = self._without_remarks(setup, lines, piece.at.mono_ns)
+                lines = self._without_remarks(setup, out, lines, piece.at.mono_ns)
                 data = b"\n".join([line for line, _ in lines])
                 break
         if link.state != "up":
             self._hearing.now.take(data)
         if lines:
-            timeline.process_read(setup, piece.at, len(piece.data), len(lines), lines[-1][1])
+            timeline.process_read(setup, out, piece.at, len(piece.data), len(lines), lines[-1][1])
         for line, following in lines:
-            self._echo.received(line)
-            reply = self._line(setup, line, piece.at, following)
+            self._echo.received(line, out.lines)
+            reply = self._line(setup, out, line, piece.at, following)
             if reply is None:
-                timeline.skip_bad(setup)
+                timeline.skip_bad(setup, out)
             else:
                 feedback.append(reply)
             if link.state != "up":
@@ -383,15 +349,15 @@ class McuSession(Struct):
         return feedback
 
     def _without_remarks(
-        self, setup: LinkSetup, lines: list[tuple[bytes, int]], at_ns: Ns
+        self, setup: LinkSetup, out: Output, lines: list[tuple[bytes, int]], at_ns: Ns
     ) -> list[tuple[bytes, int]]:
         # A remark is not a reply, so it is not used for the sample times and the link.
         for line, _ in lines:
             if line.startswith(REMARKS):
-                self._take_remark(setup, line, at_ns)
+                self._take_remark(setup, out, line, at_ns)
         return [each for each in lines if not each[0].startswith(REMARKS)]
 
-    def _take_remark(self, setup: LinkSetup, line: bytes, at_ns: Ns) -> None:
+    def _take_remark(self, setup: LinkSetup, out: Output, line: bytes, at_ns: Ns) -> None:
         if line.startswith(STATUS):
             self._take_status(setup, line, at_ns)
             return
@@ -403,7 +369,7 @@ class McuSession(Struct):
             self._link.bad(setup.checked)
         elif not self._echo.named(at_ns):
             self._restart(
-                f"has restarted and sent its start line: {line.decode('ascii', 'replace')}"
+                out, f"has restarted and sent its start line: {line.decode('ascii', 'replace')}"
             )
 
     def _take_status(self, setup: LinkSetup, line: bytes, at_ns: Ns) -> None:
@@ -416,7 +382,7 @@ class McuSession(Struct):
             self._hearing.now.statuses += 1
 
     def _line(
-        self, setup: LinkSetup, line: bytes, read_at: Instant, following: int
+        self, setup: LinkSetup, out: Output, line: bytes, read_at: Instant, following: int
     ) -> Feedback | None:
         if self._echo.trouble:
             self._reject(self._echo.trouble)
@@ -427,7 +393,7 @@ class McuSession(Struct):
             if setup.checked:
                 reply = unseal(line)
                 speeds, reading = setup.codec.decode(reply.plain), reply.reading
-                asked_ns = self._open_lines.answered(reply, at_ns)
+                asked_ns = out.find(reply, at_ns)
             else:
                 speeds = setup.codec.decode(line)
         except FrameError as error:
@@ -440,9 +406,9 @@ class McuSession(Struct):
         since_ns = self._link.good(at_ns, setup.quiet_ns)
         silent = since_ns is None or since_ns > setup.quiet_ns
         length = len(line) + 2
-        feedback = timeline.place(setup, speeds, reading, following, length, silent, asked_ns)
+        feedback = timeline.place(setup, out, speeds, reading, following, length, silent, asked_ns)
         if setup.checked:
-            self._check_samples(reading)
+            self._check_samples(out, reading)
         count = setup.count if timeline.counts_check.agrees else 0.0
         return self.count_recovery.recover_counts(feedback, count, setup.shows_counts)
 
@@ -457,7 +423,7 @@ class McuSession(Struct):
             self._reject(error.reason, line)
             self._link.bad(setup.checked)
 
-    def _check_samples(self, reading: Reading | None) -> None:
+    def _check_samples(self, out: Output, reading: Reading | None) -> None:
         # Of a good line on a checked link.
         self._plain_lines, self._unchecked = 0, False
         self._sampled = reading is not None
@@ -468,7 +434,7 @@ class McuSession(Struct):
             if more := self._timeline.leaps - self.rejects.get("count_leap", 0):
                 self._reject("count_leap", more=more)
             if self._timeline.restarted:
-                self._restart("has restarted: its clock went back")
+                self._restart(out, "has restarted: its clock went back")
 
     def _plain(self, setup: LinkSetup, line: bytes) -> bool:
         # On a checked link that is not up. The first one answers the stop after the opening.

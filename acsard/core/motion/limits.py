@@ -9,74 +9,63 @@ from __future__ import annotations
 
 import math
 
-from msgspec import Struct
-
 from acsard.core.config.settings import LimitsConfig
 from acsard.core.motion.kinematics import Kinematics
-from acsard.core.values import REST, Twist
+from acsard.core.values import AT_REST, Motion, Twist
 
 
-class Motion(Struct, frozen=True):
-    """An allowed twist, and the acceleration of each axis that led to it."""
+def follow(
+    motion: Motion,
+    wished: Twist,
+    dt: float,
+    limits: LimitsConfig,
+    kinematics: Kinematics,
+    cap: float = math.inf,
+) -> Motion:
+    """Return the motion `dt` s later, towards a finite twist; `cap` also limits the speed.
 
-    twist: Twist = REST
-    linear_slope: float = 0.0
-    angular_slope: float = 0.0
-
-    def follow(
-        self,
-        wished: Twist,
-        dt: float,
-        limits: LimitsConfig,
-        kinematics: Kinematics,
-        cap: float = math.inf,
-    ) -> Motion:
-        """Return the motion `dt` s later, towards a finite twist; `cap` also limits the speed.
-
-        A robot that is faster than the limits slows down as configured, but a lower wheel speed has
-        no ramp, so lower it only at rest.
-        """
-        now = self.twist
-        goal = kinematics.saturate(_within_speed(wished, limits, cap), limits.wheel_speed)
-        if now == goal and self.linear_slope == self.angular_slope == 0.0:
-            return self  # as in most steps
-        linear, linear_slope = _approach(
-            now.linear,
-            goal.linear,
-            self.linear_slope,
-            dt,
-            limits.linear_acceleration,
-            limits.linear_deceleration,
-            limits.linear_jerk,
-        )
-        angular, angular_slope = _approach(
-            now.angular,
-            goal.angular,
-            self.angular_slope,
-            dt,
-            limits.angular_acceleration,
-            limits.angular_deceleration,
-            limits.angular_jerk,
-        )
-        twist = _fitted(now, Twist(linear, angular), kinematics, limits.wheel_speed)
-        return Motion(twist, linear_slope, angular_slope)
-
-    def coast(self, dt: float, limits: LimitsConfig, stop: bool = False) -> Motion:
-        """Return the motion `dt` s later, both speeds reduced towards rest in proportion.
-
-        `stop` uses `*_stop_deceleration`. A negative `dt` is 0, and cannot speed up the robot.
-        """
-        dt, twist = max(0.0, dt), self.twist
-        if stop:
-            linear, angular = limits.linear_stop_deceleration, limits.angular_stop_deceleration
-        else:
-            linear, angular = limits.linear_deceleration, limits.angular_deceleration
-        seconds = max(abs(twist.linear) / linear, abs(twist.angular) / angular)
-        share = 1.0 - dt / seconds if seconds > dt else 0.0
-        return Motion(Twist(twist.linear * share, twist.angular * share)) if share else AT_REST
+    A robot that is faster than the limits slows down as configured, but a lower wheel speed has
+    no ramp, so lower it only at rest.
+    """
+    now = motion.twist
+    goal = kinematics.saturate(_within_speed(wished, limits, cap), limits.wheel_speed)
+    if now == goal and motion.linear_slope == motion.angular_slope == 0.0:
+        return motion  # as in most steps
+    linear, linear_slope = _approach(
+        now.linear,
+        goal.linear,
+        motion.linear_slope,
+        dt,
+        limits.linear_acceleration,
+        limits.linear_deceleration,
+        limits.linear_jerk,
+    )
+    angular, angular_slope = _approach(
+        now.angular,
+        goal.angular,
+        motion.angular_slope,
+        dt,
+        limits.angular_acceleration,
+        limits.angular_deceleration,
+        limits.angular_jerk,
+    )
+    twist = _fitted(now, Twist(linear, angular), kinematics, limits.wheel_speed)
+    return Motion(twist, linear_slope, angular_slope)
 
 
-AT_REST = Motion()  # without a ramp, if it replaces another motion
+def coast(motion: Motion, dt: float, limits: LimitsConfig, stop: bool = False) -> Motion:
+    """Return the motion `dt` s later, both speeds reduced towards rest in proportion.
+
+    `stop` uses `*_stop_deceleration`. A negative `dt` is 0, and cannot speed up the robot.
+    """
+    dt, twist = max(0.0, dt), motion.twist
+    if stop:
+        linear, angular = limits.linear_stop_deceleration, limits.angular_stop_deceleration
+    else:
+        linear, angular = limits.linear_deceleration, limits.angular_deceleration
+    seconds = max(abs(twist.linear) / linear, abs(twist.angular) / angular)
+    share = 1.0 - dt / seconds if seconds > dt else 0.0
+    return Motion(Twist(twist.linear * share, twist.angular * share)) if share else AT_REST
 
 
 def _within_speed(wished: Twist, limits: LimitsConfig, cap: float) -> Twist:
