@@ -37,7 +37,7 @@ LinkCode = Literal[
 ]  # fmt: skip
 
 # Why the pose may be far off although the link is up.
-PoseCode = Literal["encoder_counts_wrong", "coarse_encoder"]
+PoseCode = Literal["encoder_counts_wrong", "encoder_counts_missing", "coarse_encoder"]
 
 # This computer or the built-in simulator is to blame.
 HOST_CODES: tuple[LinkCode, ...] = ("host_late", "simulator_fault")
@@ -324,6 +324,10 @@ encoder_counts_wrong
     the angles by the board's counts and by its speeds differ, so mcu.encoder_counts is wrong, and
     the pose uses the speeds:
     -> write the counts per turn of a wheel that `acsard mcu check` shows
+encoder_counts_missing
+    the speeds jump as those of coarse encoders do, and mcu.encoder_counts is not set, so the
+    heading drifts, and damaged lines are not noticed:
+    -> write the counts per turn of a wheel; `acsard mcu check` shows about how many they are
 coarse_encoder
     the encoders are coarse, and lines get lost or come after varying delays, so the pose may be far
     off:

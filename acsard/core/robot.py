@@ -19,7 +19,7 @@ from acsard.core.config.live import Changes, changed, describe_changes
 from acsard.core.config.parsing import ConfigError
 from acsard.core.config.settings import Config, LimitsConfig
 from acsard.core.link.board_status import as_text
-from acsard.core.link.feedback import Feedback
+from acsard.core.link.feedback import Line
 from acsard.core.link.link_setup import LinkSetup
 from acsard.core.link.link_state import WATCHDOG_S
 from acsard.core.link.output import QUESTION_LINE
@@ -81,6 +81,8 @@ PORT_LENT = (
 
 NOTHING_CHANGED = "nothing changed: all settings already have these values"
 
+UNDECLARED = "with fewer than 400 encoder counts per turn of a wheel, set mcu.encoder_counts"
+
 MAX_REFUSAL_LENGTH = 200  # characters in `state`: the text may quote the message of a client
 
 
@@ -120,8 +122,8 @@ class Robot:
         refused, since_ns = state.refused or ("", None)
         counters = {"lines": session.good_lines} | state.odometry.counters()
         counters |= {f"line_{reason}": count for reason, count in session.rejects.items() if count}
-        if session.count_recovery.coarse_lines:
-            counters["coarse_encoder_lines"] = session.count_recovery.coarse_lines
+        if session.coarse_lines:
+            counters["coarse_encoder_lines"] = session.coarse_lines
         checks = state.checks
         life = state.life
         ages = {number: (now_ns - at_ns) / NS_PER_S for number, at_ns in life.shown.items()}
@@ -142,7 +144,7 @@ class Robot:
             doubt=checks.wheels_status(self.config.feedback),
             check=session.check(self.link_setup),
             unanswered=state.unanswered.told,
-            encoders=session.count_recovery.counts(self.config.mcu.encoder_counts),
+            encoders=session.encoder_counts(self.link_setup),
             pose_doubt=session.doubt.code,
             port_released=life.port_released,
             sender=state.choice.sender,
@@ -446,7 +448,7 @@ class Robot:
         age_s = (now_ns - status_ns) / NS_PER_S
         return as_text(state.session.status.last) | {"age_s": f"{age_s:.1f}"}
 
-    def _is_plausible(self, line: Feedback, now: Instant, events: list[Event]) -> bool:
+    def _is_plausible(self, line: Line, now: Instant, events: list[Event]) -> bool:
         state = self.state
         why = state.sanity.impossible(line, self.config.feedback.wheel_speed)
         if state.sanity.warning is not None:
@@ -459,10 +461,11 @@ class Robot:
         )
         state.odometry.skipped.add(line)
         if state.sanity.doubtful:
-            self._fault(reason("impossible_speeds", cause=why), now, events)
+            cause = why if self.config.mcu.encoder_counts else f"{why}; {UNDECLARED}"
+            self._fault(reason("impossible_speeds", cause=cause), now, events)
         return False
 
-    def _check_and_integrate(self, line: Feedback, now: Instant, events: list[Event]) -> Estimate:
+    def _check_and_integrate(self, line: Line, now: Instant, events: list[Event]) -> Estimate:
         state = self.state
         checks = state.checks
         wheels = checks.wheels

@@ -97,6 +97,20 @@ def test_a_coarse_encoder_behind_an_adapter_of_16_ms_advises_the_checked_link(co
     assert robot.state.pose_doubt == "coarse_encoder"
 
 
+@pytest.mark.parametrize("link_check", ["off", "on"])
+@pytest.mark.parametrize(
+    ("counts", "code"), [(16, "encoder_counts_missing"), (96, "encoder_counts_missing"), (400, "")]
+)
+def test_coarse_encoders_whose_counts_are_not_declared_advise_to_declare_them(
+    counts: int, code: str, link_check: str
+) -> None:
+    robot = world(counts, link_check, 0)
+    drive(robot)
+    assert robot.state.pose_doubt == code
+    doubts = [event.text for event in robot.events if event.name == "pose_doubtful"]
+    assert ["mcu.encoder_counts is not set" in text for text in doubts] == [True] * bool(code)
+
+
 def lost(robot: World) -> None:
     robot.mcu.lose_reply = 20
 

@@ -133,20 +133,7 @@ def test_impossible_lines_do_not_teach_that_the_encoders_are_coarse(
     assert abs(world.state.yaw) < 0.05
 
 
-@pytest.mark.parametrize(
-    "speeds_up",
-    [
-        False,
-        pytest.param(
-            True,
-            marks=pytest.mark.xfail(
-                strict=True,
-                reason="between two counts a wheel looks slow, which takes back the time for which "
-                "it was too fast: with evenly spaced lines the verdict is never reached",
-            ),
-        ),
-    ],
-)
+@pytest.mark.parametrize("speeds_up", [False, True])
 def test_wheels_with_few_counts_are_a_fault_only_if_they_are_too_fast(speeds_up: bool) -> None:
     """The board is asked as often as possible without its counts."""
     config = Config(control=ControlConfig(rate=MOST_ASKED_HZ), sim=SimConfig(encoder_counts=16))

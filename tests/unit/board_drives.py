@@ -17,7 +17,7 @@ import numpy as np
 from msgspec import Struct
 
 from acsard.core.config.settings import McuConfig
-from acsard.core.link.feedback import Feedback
+from acsard.core.link.feedback import Line
 from acsard.core.link.link_setup import LinkSetup
 from acsard.core.link.output import QUESTION_LINE, Output
 from acsard.core.link.session import McuSession
@@ -107,7 +107,7 @@ class Host:
         self.setup, self.session, self.out = LinkSetup.of(mcu, RATE), McuSession(), Output()
         self.found, self.counted = Odometer(counts=case.counts), Pose()
         self.made: list[float] = []
-        self.heard: list[Feedback] = []
+        self.heard: list[Line] = []
         self.now = self._reported = 0.0  # times of the last step, and of the last new speeds
         self._wheels, self._speeds = self._turned(0.0), WheelSpeeds()
         starts = np.arange(case.stall_every * 0.7, seconds - 1.0, case.stall_every)

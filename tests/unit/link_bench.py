@@ -5,7 +5,7 @@ from __future__ import annotations
 from acsard.core.codes import Reason
 from acsard.core.config.settings import McuConfig
 from acsard.core.link.checked_line import seal
-from acsard.core.link.feedback import Feedback
+from acsard.core.link.feedback import Line
 from acsard.core.link.link_setup import LinkSetup
 from acsard.core.link.link_state import GOOD_LINES
 from acsard.core.link.output import QUESTION_LINE, Output
@@ -56,7 +56,7 @@ class LinkBench:
         assert line is not None
         return seal(GOOD, int(line.partition(b"#")[2][:2], 16))
 
-    def update(self, left: bool, ms: float = 10, *reads: bytes) -> list[Feedback]:
+    def update(self, left: bool, ms: float = 10, *reads: bytes) -> list[Line]:
         """Let time pass, then update the session with these reads.
 
         `left` says whether the port has sent the last line.
@@ -80,7 +80,7 @@ class LinkBench:
         if line == QUESTION_LINE:
             session.asks(made_ns)
 
-    def wait(self, ms: float, *reads: bytes) -> list[Feedback]:
+    def wait(self, ms: float, *reads: bytes) -> list[Line]:
         """Update the session after `ms`.
 
         Before that, the stop and the question with which a session begins leave the port.
@@ -97,7 +97,7 @@ class LinkBench:
             self.wait(10, *reads)
         return self.link
 
-    def talk(self, ms: int = 10, count: int = 1) -> list[Feedback]:
+    def talk(self, ms: int = 10, count: int = 1) -> list[Line]:
         """Send a line and receive its answer `ms` later, `count` times."""
         samples = []
         for _ in range(count):

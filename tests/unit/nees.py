@@ -19,7 +19,7 @@ from msgspec import Struct
 from numpy.typing import NDArray
 
 from acsard.core.config.settings import OdometryConfig
-from acsard.core.link.feedback import Feedback
+from acsard.core.link.feedback import Line
 from acsard.core.values import Instant, WheelSpeeds
 from tests.unit.odometer import Odometer
 
@@ -83,7 +83,7 @@ def random(rng: np.random.Generator, seconds: float = 90.0) -> Legs:
     return legs
 
 
-Heard = Callable[[Array, np.random.Generator], list[Feedback]]
+Heard = Callable[[Array, np.random.Generator], list[Line]]
 """Returns the feedback lines that arrive from a drive."""
 
 Scenario = Callable[[np.random.Generator], Legs]
@@ -139,7 +139,7 @@ def true_ends(drives: list[Array], robots: int, model: Model, rng: np.random.Gen
     return pose
 
 
-def fold(lines: Iterable[Feedback], model: Model, counts: int = 0) -> tuple[Array, Array]:
+def fold(lines: Iterable[Line], model: Model, counts: int = 0) -> tuple[Array, Array]:
     """Return the final pose and covariance of odometry."""
     robot = Odometer(model.config(), counts)
     for line in lines:
@@ -149,9 +149,9 @@ def fold(lines: Iterable[Feedback], model: Model, counts: int = 0) -> tuple[Arra
     return np.array([pose.x, pose.y, pose.yaw]), np.array(covariance)
 
 
-def plain(drive: Array) -> list[Feedback]:
+def plain(drive: Array) -> list[Line]:
     """Return the speeds of a drive as feedback lines."""
-    return [Feedback(AT, WheelSpeeds(r, le, le, r), PERIOD) for le, r in drive.tolist()]
+    return [Line(AT, WheelSpeeds(r, le, le, r), PERIOD) for le, r in drive.tolist()]
 
 
 def errors(pose: Array, ends: Array) -> Array:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 
 from acsard.core.config.settings import DriveConfig, LimitsConfig, OdometryConfig
-from acsard.core.link.feedback import Feedback
+from acsard.core.link.feedback import Line
 from acsard.core.motion.agreement import claims
 from acsard.core.motion.consistency import ConsistencyChecks
 from acsard.core.motion.gyro import Gyro
@@ -36,12 +36,12 @@ class Odometer:
         """Use this gyro, whether one is configured or not."""
         self.checks.gyro, self.model.claims = gyro, self._claims
 
-    def fold(self, line: Feedback, commanded: WheelSpeeds | None = None) -> Estimate:
+    def fold(self, line: Line, commanded: WheelSpeeds | None = None) -> Estimate:
         if commanded is not None:
             self.checks.wheels.commanded = commanded
         return self.odometry.fold(line, self.checks, self.model)
 
-    def skip(self, line: Feedback) -> None:
+    def skip(self, line: Line) -> None:
         self.odometry.skipped.add(line)
 
     def set_pose(self, pose: Pose) -> None:

@@ -21,7 +21,7 @@ from acsard.calibration.log import Log, Run
 from acsard.calibration.noise import noise
 from acsard.calibration.result import calibrate
 from acsard.core.config.settings import Config, DriveConfig, OdometryConfig
-from acsard.core.link.feedback import Feedback
+from acsard.core.link.feedback import Line
 from acsard.core.values import WheelSpeeds
 from tests.unit.calibration_logs import WAYS, runs
 from tests.unit.calibration_robots import (
@@ -130,7 +130,7 @@ def judged(
     end = begin + (end - begin) // LINES * LINES
     sides = (side[begin:end].reshape(-1, LINES).mean(axis=1) for side in (trip.left, trip.right))
     for left, right in zip(*sides, strict=True):
-        line = Feedback(AT, WheelSpeeds(right, left, left, right), 0.01 * LINES)
+        line = Line(AT, WheelSpeeds(right, left, left, right), 0.01 * LINES)
         estimate = odom.fold(line)
     start = 0j if begin == 0 else trip.where[begin - 1]
     yaw = 0.0 if begin == 0 else trip.yaw[begin - 1]

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from msgspec.structs import replace
 
-from acsard.core.link.feedback import Feedback
+from acsard.core.link.feedback import Line
 from acsard.core.values import WheelSpeeds
 from tests.unit.nees import (
     AT,
@@ -79,14 +79,13 @@ def counting(counts: int) -> Heard:
     Each counter starts at a random fraction of a count.
     """
 
-    def lines_of(drive: Array, rng: np.random.Generator) -> list[Feedback]:
+    def lines_of(drive: Array, rng: np.random.Generator) -> list[Line]:
         wheels = drive[:, [1, 0, 0, 1]] * PERIOD / math.tau * counts
         counted = np.floor(np.cumsum(wheels, axis=0) + rng.random(4))
         turned = np.diff(counted, axis=0, prepend=counted[:1]) * math.tau / counts
         rows = zip(drive.tolist(), turned.tolist(), strict=True)
         return [
-            Feedback(AT, WheelSpeeds(r, le, le, r), PERIOD, turned=tuple(row))
-            for (le, r), row in rows
+            Line(AT, WheelSpeeds(r, le, le, r), PERIOD, turned=tuple(row)) for (le, r), row in rows
         ]
 
     return lines_of

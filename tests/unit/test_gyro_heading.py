@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from acsard.core.config.settings import DriveConfig, OdometryConfig
-from acsard.core.link.feedback import Feedback
+from acsard.core.link.feedback import Line
 from acsard.core.motion.gyro import Gyro, Turn
 from acsard.core.motion.kinematics import Kinematics
 from acsard.core.motion.uncertainty import ErrorModel
@@ -34,19 +34,19 @@ class Listening(Gyro):
 
 
 @st.composite
-def feedback(draw: st.DrawFn) -> Feedback:
+def feedback(draw: st.DrawFn) -> Line:
     """Return a line with or without counts, missing time or a gap, of wheels that never rest."""
     left, right = draw(WHEEL), draw(WHEEL)
     speeds, at = WheelSpeeds(right, left, left, right), Instant(0, 0)
     match draw(st.sampled_from(("plain", "bridged", "counts", "gap"))):
         case "gap":
-            return Feedback(at, speeds, 0.0, 0.5)
+            return Line(at, speeds, 0.0, 0.5)
         case "counts":
             a, b, c, d = (speed * 0.01 for speed in speeds.as_tuple())
-            return Feedback(at, speeds, 0.01, turned=(a, b, c, d))
+            return Line(at, speeds, 0.01, turned=(a, b, c, d))
         case "bridged":
-            return Feedback(at, speeds, 0.31, bridged=0.3)
-    return Feedback(at, speeds, 0.01)
+            return Line(at, speeds, 0.31, bridged=0.3)
+    return Line(at, speeds, 0.01)
 
 
 WHEEL = st.floats(1.0, 20.0)  # never at rest, because counts are held back there
@@ -54,7 +54,7 @@ WHEEL = st.floats(1.0, 20.0)  # never at rest, because counts are held back ther
 
 @given(st.lists(st.tuples(feedback(), st.booleans()), max_size=30))
 def test_the_turn_of_the_wheels_that_a_gyro_gets_is_the_turn_of_the_heading(
-    lines: list[tuple[Feedback, bool]],
+    lines: list[tuple[Line, bool]],
 ) -> None:
     robot, listening = Odometer(counts=3200), Listening()
     robot.use(listening)
@@ -88,7 +88,7 @@ class Turning:
             self.true += twist.angular / 100
             measured = twist.angular * self.scale if self.hangs_at is None else self.hangs_at
             self.gyro.add_samples((GyroSample(self.now_ns, None, measured),))
-            line = Feedback(Instant(self.now_ns, self.now_ns), speeds, 0.01)
+            line = Line(Instant(self.now_ns, self.now_ns), speeds, 0.01)
             self.yaw_variance = self.robot.fold(line, speeds).covariance.yawyaw
 
     @property

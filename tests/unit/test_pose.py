@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from acsard.core.link.feedback import Feedback
+from acsard.core.link.feedback import Line
 from acsard.core.motion.gaps import AT_REST, LONG_S, Rolled, Skipped, rolled_over
 from acsard.core.motion.gyro import Gyro, Turn
 from acsard.core.values import Estimate, Instant, Pose, Twist, WheelSpeeds
@@ -25,15 +25,15 @@ moves = st.lists(st.tuples(wheel_speed, wheel_speed, st.floats(0.0, 0.1)), max_s
 """Moves as left and right (rad/s) and dt (s)."""
 
 
-def feedback(left: float, right: float, dt: float, **more: Any) -> Feedback:
-    return Feedback(AT, WheelSpeeds(right, left, left, right), dt, **more)
+def feedback(left: float, right: float, dt: float, **more: Any) -> Line:
+    return Line(AT, WheelSpeeds(right, left, left, right), dt, **more)
 
 
-def line(speed: float, dt: float = 0.01, **more: Any) -> Feedback:
+def line(speed: float, dt: float = 0.01, **more: Any) -> Line:
     return feedback(speed, speed, dt, **more)
 
 
-def counts(*turned: float, speed: float = 0.0, dt: float = 0.01, gap: float = 0.0) -> Feedback:
+def counts(*turned: float, speed: float = 0.0, dt: float = 0.01, gap: float = 0.0) -> Line:
     """Return a line whose wheels turned by these angles, rad. A single number is for all wheels."""
     return line(speed, dt, gap=gap, turned=turned if len(turned) == 4 else turned * 4)
 
@@ -100,7 +100,7 @@ def test_counts_that_agree_with_the_speeds_make_the_same_path(path: list[Three])
 
 
 @each("after", [counts(1.0), line(20.0, 0.05)])
-def test_the_counts_of_skipped_lines_are_not_lost(after: Feedback) -> None:
+def test_the_counts_of_skipped_lines_are_not_lost(after: Line) -> None:
     robot = Odometer()
     for _ in range(10):
         robot.skip(counts(1.0, speed=99.0))
@@ -111,7 +111,7 @@ def test_the_counts_of_skipped_lines_are_not_lost(after: Feedback) -> None:
 # gaps and skipped lines
 
 
-def roll(feedback: Feedback, *skipped: Feedback) -> Rolled:
+def roll(feedback: Line, *skipped: Line) -> Rolled:
     """Return how far a line rolls whose wheels turned at 10 rad/s before it."""
     before = Skipped()
     for one in skipped:
@@ -137,7 +137,7 @@ def roll(feedback: Feedback, *skipped: Feedback) -> Rolled:
     ],
 )  # fmt: skip
 def test_how_far_a_line_rolls(
-    lines: list[Feedback], angle: float, seconds: float, filled: float, unknown: float
+    lines: list[Line], angle: float, seconds: float, filled: float, unknown: float
 ) -> None:
     rolled = roll(*lines)
     assert rolled.angles == pytest.approx((angle,) * 4)
@@ -149,11 +149,11 @@ def test_how_far_a_line_rolls(
 def test_a_wheel_that_alone_is_fast_after_a_gap_does_not_fill_it(wheel: int) -> None:
     speeds = [0.0] * 4
     speeds[wheel] = 40.0
-    damaged = Feedback(AT, WheelSpeeds(*speeds), 0.31, bridged=0.3)
+    damaged = Line(AT, WheelSpeeds(*speeds), 0.31, bridged=0.3)
     assert rolled_over(Skipped(), damaged, AT_REST).angles == AT_REST
     robot = Odometer()
     robot.fold(line(0.0))
-    assert robot.fold(Feedback(AT, WheelSpeeds(*speeds), LONG_S + 0.04)).pose == Pose()
+    assert robot.fold(Line(AT, WheelSpeeds(*speeds), LONG_S + 0.04)).pose == Pose()
 
 
 def test_gaps_and_bridged_times_are_counted_but_a_gap_at_rest_is_not() -> None:

@@ -1,27 +1,24 @@
-"""Whole counts from the speeds of a line, and the smallest step of a speed."""
+"""Whole counts from the speeds of a line, and whether the encoders are coarse."""
 
 from __future__ import annotations
 
 import itertools
 import math
 import random
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from acsard.core.link.coarse_encoders import CoarseEncoders
 from acsard.core.link.codec import Motors
-from acsard.core.link.feedback import Feedback
-from acsard.core.link.quantization import BLOCK_STEPS, FIRST_STEPS, CountRecovery, Steps
 from acsard.core.link.whole_counts import MAX_DOUBT
 from acsard.core.link.whole_counts import WholeCounts as Recovered
-from acsard.core.values import Instant, WheelSpeeds
 from tests.each import each
 
 Array = NDArray[np.float64]
 PERIOD = 0.01
-AT = Instant(0, 0)
 
 
 def angles(seed: int, seconds: float, jitter: float) -> tuple[Array, Array]:
@@ -65,41 +62,59 @@ def lines(
         yield (a, b, c, d), number
 
 
-def test_without_configured_counts_no_line_has_whole_counts_and_coarse_lines_are_counted() -> None:
-    for counts, coarse in ((20, True), (3200, False)):
-        recovery = CountRecovery()
-        first = recovery.recover_counts(Feedback(AT, WheelSpeeds(), PERIOD), 0.0)
-        assert first.steps == (math.inf,) * 4
-        for speeds, _ in lines(counts):
-            line = recovery.recover_counts(Feedback(AT, WheelSpeeds(*speeds), PERIOD), 0.0)
-            assert line.counted is None
-        assert recovery.counts(0) == (0,) * 4
-        assert (recovery.coarse_lines > 1000) == coarse == bool(recovery.coarse_lines)
+def found(encoders: CoarseEncoders, some: Iterable[Motors], elapsed: float = PERIOD) -> str:
+    for speeds in some:
+        encoders.step(speeds, elapsed)
+    return encoders.found
 
 
-def steps_after(speeds: list[float], steps: Steps | None = None) -> Steps:
-    steps = steps or Steps()
-    for speed in speeds:
-        steps.add(speed, 39.0)
-    return steps
+@each("counts", [16, 20, 48, 96])
+@each("jitter", [0.0, 0.002])
+def test_coarse_encoders_are_found_in_the_speeds(counts: int, jitter: float) -> None:
+    encoders = CoarseEncoders()
+    assert found(encoders, (speeds for speeds, _ in lines(counts, jitter))) == "coarse"
+    assert encoders.lines > 2000
 
 
-def fine_speeds(count: int) -> list[float]:
-    dice = random.Random(1)
-    return [round(10 + dice.uniform(-0.2, 0.2) + 0.02 * i, 2) for i in range(count)]
+@each("counts", [400, 1024, 3200])
+@each("window", [0.004, 0.005, 0.01])
+def test_fine_encoders_are_not_although_the_board_counts_for_less_than_a_line(
+    counts: int, window: float
+) -> None:
+    encoders, dice = CoarseEncoders(), random.Random(counts)
+    for speeds, _ in lines(counts):
+        step = math.tau / counts / window
+        a, b, c, d = [step * math.floor(speed / step + dice.random()) for speed in speeds]
+        encoders.step((a, b, c, d), PERIOD)
+        assert encoders.found != "coarse"
+    assert (encoders.found, encoders.lines) == ("fine", 0)
 
 
-def test_a_quantization_step_is_known_once_it_has_recurred_and_while_it_does() -> None:
-    steps = steps_after([0.1 * (i % 2) for i in range(FIRST_STEPS)])
-    assert steps.size == math.inf
-    assert steps_after([0.2], steps).size < 0.3
-    steps = steps_after(fine_speeds(2 * BLOCK_STEPS + 8))
-    assert steps_after([40.0, 12.0], steps).size < 0.5
-    steps = steps_after([0.0, 30.0] * BLOCK_STEPS)
-    assert steps.size == 30.0
-    assert steps_after(fine_speeds(3 * BLOCK_STEPS), steps).size < 0.5
-    # Larger changes than the coarsest encoder causes do not count.
-    assert steps_after([0.0, 40.0] * BLOCK_STEPS, steps).size < 0.5
+def fine(count: int) -> list[Motors]:
+    dice, rows = random.Random(1), []
+    for i in range(count):
+        a, b, c, d = [round(10 + dice.uniform(-0.2, 0.2) + 0.02 * i, 2) for _ in range(4)]
+        rows.append((a, b, c, d))
+    return rows
+
+
+def test_accelerations_and_single_damaged_wheels_do_not_look_like_coarse_encoders() -> None:
+    lifted = [(speed,) * 4 for speed in (*range(0, 60, 6), *range(60, 0, -6))]
+    assert found(CoarseEncoders(), [*fine(100), *lifted, *fine(100), *lifted]) == "fine"
+    assert found(CoarseEncoders(), [(30.0, 10.0, 10.0, 10.0), *fine(9)] * 40) == "fine"
+    # Not even the coarsest encoder jumps so far.
+    assert found(CoarseEncoders(), [*fine(100), *[(95.0,) * 4, (0.0,) * 4] * 100]) == "fine"
+
+
+def test_encoders_may_turn_out_to_be_coarse_or_fine_after_all_and_are_unknown_before() -> None:
+    encoders = CoarseEncoders()
+    assert encoders.step((0.0,) * 4, PERIOD) == math.inf
+    assert found(encoders, fine(200)) == "fine"
+    assert found(encoders, [(31.4, 31.4, 10.0, 10.0), (10.0,) * 4] * 3) == ""
+    assert found(encoders, [(31.4,) * 4, (10.0,) * 4] * 3) == "coarse"
+    assert found(encoders, fine(200)) == "fine"
+    encoders.forget()
+    assert encoders.found == ""
 
 
 class WholeCounts:
@@ -171,17 +186,17 @@ def test_a_missing_line_counts_once_whether_its_command_or_its_reply_was_lost(
     way, at = angles(3, 60.0, 0.004)
     whole = np.floor(way * counts / math.tau)
     indices = np.flatnonzero(np.arange(len(way)) % 3 != 0)
-    recovery, total, before = CountRecovery(), np.zeros(4), np.zeros(4)
+    recovery, total, before = Recovered(), np.zeros(4), np.zeros(4)
     for last, this in itertools.pairwise(indices.tolist()):
         began = last if lost == "command" else this - 1
         speeds = (whole[this] - whole[began]) * math.tau / counts / (at[this] - at[began])
         bridged = (this - last - 1) * PERIOD
-        speeds_read = WheelSpeeds(*np.round(speeds, 2).tolist())
-        line = Feedback(AT, speeds_read, bridged + PERIOD, bridged=bridged)
-        result = recovery.recover_counts(line, math.tau / counts)
-        rates = np.array(result.speeds.as_tuple())
-        total += np.array(result.counted or rates * (result.dt - result.bridged))
-        total += result.bridged * (before + rates) / 2
+        a, b, c, d = np.round(speeds, 2).tolist()
+        speeds_read = a, b, c, d
+        rates = np.array(speeds_read)
+        counted = recovery.turned(math.tau / counts, speeds_read, PERIOD, 0.0, bridged)
+        gap = 0.0 if recovery.covers_gap else bridged
+        total += np.array(counted or rates * (bridged + PERIOD - gap)) + gap * (before + rates) / 2
         before = rates
     true = way[indices[-1]] - way[indices[0]]
     assert float(np.max(np.abs(total - true) / np.abs(true))) < most

@@ -10,7 +10,7 @@ import pytest
 
 from acsard.core.config.settings import FeedbackConfig, McuConfig, WheelMap
 from acsard.core.link.checked_line import Reading
-from acsard.core.link.feedback import Feedback, Timeline
+from acsard.core.link.feedback import Line, Timeline
 from acsard.core.link.link_setup import LinkSetup
 from acsard.core.link.output import Output
 from acsard.core.values import AT_REST, Instant, WheelSpeeds
@@ -44,7 +44,7 @@ class Bench:
         ms: float = 10,
         mcu_ms: int | None = None,
         gap: bool = False,
-    ) -> Feedback:
+    ) -> Line:
         """Return the feedback of a line `ms` later on both clocks, with or without counts."""
         self.now_ns += int(ms * MS)
         self.mcu_ms += int(ms) if mcu_ms is None else mcu_ms
@@ -62,7 +62,7 @@ class Bench:
         reading: Reading | None = None,
         gap: bool = False,
         asked_ns: int | None = None,
-    ) -> list[Feedback]:
+    ) -> list[Line]:
         """Read this many lines at once, `ms` later. With `gap`, the first one follows a silence."""
         self.now_ns += int(ms * MS)
         at = Instant(self.now_ns, self.now_ns + 7)
@@ -82,7 +82,7 @@ class Bench:
 
     def answered(
         self, sent_ms: float, came_ms: float, *lost: float, gap: bool = False
-    ) -> list[Feedback]:
+    ) -> list[Line]:
         """Read at `came_ms` the answer to a line that left at `sent_ms`; `lost` are later lines."""
         began_ns = 9000 * MS
         self.now_ns = began_ns + int(sent_ms * MS)
@@ -101,11 +101,11 @@ def test_the_first_line_has_a_time_but_neither_dt_nor_gap() -> None:
     assert found == (SPEEDS, 0.0, 0.0, bench.now_ns)
 
 
-Line = dict[str, Any]
+Given = dict[str, Any]
 Sample = tuple[float, float, tuple[int, ...] | None]
 ZERO = {"counts": (0, 0, 0, 0)}
 ONE = {"counts": (10, 10, 10, 10)}
-COUNTED: dict[str, tuple[list[Line], Sample]] = {
+COUNTED: dict[str, tuple[list[Given], Sample]] = {
     # Lines, and dt, gap and the angles of the last one in tenths of a degree.
     "the host's clock": ([{}, {"ms": 12}], (0.012, 0.0, None)),
     "the board's clock": (

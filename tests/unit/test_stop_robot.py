@@ -177,6 +177,7 @@ def test_a_third_impossible_line_is_a_fault_that_brakes_by_the_stop_deceleration
     assert (rig.mode, rig.out.applied) == ("driving", GO)
     impossible(rig, 1)
     assert (rig.mode, rig.out.code) == ("fault", "impossible_speeds")
+    assert "with fewer than 400 encoder counts per turn of a wheel, set mcu.enc" in rig.out.reason
     # Each step removes 3 m/s2 x 10 ms.
     assert [rig.out.applied.linear, *rig.path(1, GO)] == pytest.approx([0.47, 0.44])
     assert rig.counters["line_implausible"] == 3

@@ -7,7 +7,7 @@ import math
 import pytest
 
 from acsard.core.config.settings import DriveConfig, FeedbackConfig
-from acsard.core.link.feedback import Feedback
+from acsard.core.link.feedback import Line
 from acsard.core.motion.gyro import Turn
 from acsard.core.motion.kinematics import Kinematics
 from acsard.core.motion.wheels import count_angle, new_wheels
@@ -205,7 +205,7 @@ def test_a_wheel_that_was_left_out_counts_again_once_it_has_agreed_for_two_secon
 def test_the_wheel_angles_are_those_of_the_encoders_even_if_a_wheel_is_left_out() -> None:
     robot = Odometer()
     for speeds in [TEN] * 100 + [only(0, 0.0)] * 100:
-        estimate = robot.fold(Feedback(AT, speeds, PERIOD), TEN)
+        estimate = robot.fold(Line(AT, speeds, PERIOD), TEN)
     assert estimate.positions == pytest.approx((10.0, 20.0, 20.0, 20.0))
     assert estimate.speeds == only(0, 0.0)
 
@@ -243,12 +243,12 @@ def test_slip_is_reported_with_its_side_until_about_half_a_second_after_its_end(
 def test_slip_makes_every_variance_a_hundred_times_larger() -> None:
     calm, slipping = Odometer(counts=3200), Odometer(counts=3200)
     for _ in range(200):
-        sure = calm.fold(Feedback(AT, TEN, PERIOD), TEN)
-        slipping.fold(Feedback(AT, TEN, PERIOD), TEN)
+        sure = calm.fold(Line(AT, TEN, PERIOD), TEN)
+        slipping.fold(Line(AT, TEN, PERIOD), TEN)
     begun = sure.covariance.yawyaw
     for _ in range(100):
-        sure = calm.fold(Feedback(AT, TEN, PERIOD), TEN)
-        unsure = slipping.fold(Feedback(AT, only(0, 12.0), PERIOD), TEN)
+        sure = calm.fold(Line(AT, TEN, PERIOD), TEN)
+        unsure = slipping.fold(Line(AT, only(0, 12.0), PERIOD), TEN)
     assert unsure.twist_variances.linear > 90 * sure.twist_variances.linear
     assert unsure.twist_variances.lateral == pytest.approx(100 * sure.twist_variances.lateral)
     assert unsure.twist_variances.angular > 90 * sure.twist_variances.angular
@@ -258,7 +258,7 @@ def test_slip_makes_every_variance_a_hundred_times_larger() -> None:
         robot = Odometer(counts=3200)
         robot.use(Says(always=Turn(0.0, 0.0, 0.0, 0.0, slips=slips)))
         for _ in range(100):
-            estimate = robot.fold(Feedback(AT, TEN, PERIOD))
+            estimate = robot.fold(Line(AT, TEN, PERIOD))
         estimates.append(estimate)
     sure, unsure = estimates
     assert unsure.twist_variances.linear / sure.twist_variances.linear == pytest.approx(100.0)

@@ -7,40 +7,40 @@ from typing import Any
 
 import pytest
 
-from acsard.core.link.feedback import Feedback
+from acsard.core.link.feedback import Line
 from acsard.core.motion import sanity as module
 from acsard.core.motion.sanity import Sanity
 from acsard.core.values import WHEELS, Event, Instant, WheelSpeeds
 from tests.each import each
 
 UNKNOWN = math.inf
-"""The quantization step of encoders that are not known yet, rad/s."""
+"""The largest change by one count of encoders that are not known yet, rad/s."""
 
 
 def only(wheel: int, speed: float, others: float = 0.0) -> WheelSpeeds:
     return WheelSpeeds(*(speed if i == wheel else others for i in range(4)))
 
 
-def line(speed: float, wheel: int = 1, others: float = 0.0, **more: Any) -> Feedback:
+def line(speed: float, wheel: int = 1, others: float = 0.0, **more: Any) -> Line:
     """Return a line with the speed of one wheel; `step` is that of all encoders."""
     speeds, step, dt = only(wheel, speed, others), more.pop("step", 0.0), more.pop("dt", 0.01)
     if more.pop("proven", False):  # the line has whole counts
         more |= {"counted": tuple(dt * each for each in speeds.as_tuple()), "count": step * dt}
-    return Feedback(Instant(0, 0), speeds, dt, steps=(step,) * 4, **more)
+    return Line(Instant(0, 0), speeds, dt, step=step, **more)
 
 
-def lines(*speeds: float, **more: Any) -> list[Feedback]:
+def lines(*speeds: float, **more: Any) -> list[Line]:
     return [line(speed, **more) for speed in speeds]
 
 
-def ten(speed: float, **more: Any) -> Feedback:
+def ten(speed: float, **more: Any) -> Line:
     return line(speed, others=speed, **more)
 
 
 GAP: dict[str, Any] = {"dt": 0.0, "gap": 0.5}
 COARSE: dict[str, Any] = {"step": 6.54}
 FINE: dict[str, Any] = {"step": 0.2}
-Row = tuple[float, float, list[Feedback], str]
+Row = tuple[float, float, list[Line], str]
 ROWS: dict[str, Row] = {
     # The limit of the speed; the limit of a change is 100 rad/s2 x 10 ms and 2 rad/s.
     "three in a row": (80, 1e9, lines(99, 99, 0, 99, 99, 99), "xx.xxF"),
@@ -70,7 +70,7 @@ ROWS: dict[str, Row] = {
     "two fine counts": (80, 100, lines(0, 4.0, step=0.5), ".."),
     "one proven count": (40, 1500, lines(70, 71.5, step=31.4, proven=True), ".x"),
     "the limit and a proven count": (40, 1500, lines(71.25, step=31.25, proven=True), "."),
-    "the limit and a learned step": (
+    "the limit and a coarse count": (
         5, 1500, lines(11.54, 0, 0, -11.54, 0, 0, 11.55, **COARSE), "......x",
     ),
     # Speeds over the limit are summed as angles: one count excuses once, not in every line.
@@ -116,7 +116,7 @@ ROWS: dict[str, Row] = {
 }  # fmt: skip
 
 
-def verdicts(sanity: Sanity, some: list[Feedback], fastest: float = 80.0) -> str:
+def verdicts(sanity: Sanity, some: list[Line], fastest: float = 80.0) -> str:
     """Return for each line: `.` possible, `x` impossible, `F` a fault."""
     found = ""
     for each_line in some:

@@ -12,11 +12,13 @@ from msgspec import Struct, field
 from acsard.core.config.wire_time import wire_ns
 from acsard.core.link.board_counts import CountsCheck, Encoders, Turned
 from acsard.core.link.checked_line import Reading
+from acsard.core.link.coarse_encoders import CoarseEncoders
 from acsard.core.link.codec import Motors
 from acsard.core.link.line_times import FreeRunning, Prompted
 from acsard.core.link.link_setup import LinkSetup
 from acsard.core.link.output import Output
-from acsard.core.values import NS_PER_S, Instant, Ns, WheelSpeeds
+from acsard.core.link.whole_counts import WholeCounts
+from acsard.core.values import NS_PER_S, Instant, Ns, Rad, RadPerS, Seconds, WheelSpeeds
 
 # Only shorter gaps are filled: the board may have been reset in a longer one.
 MAX_FILLED_GAP_S = 1.0
@@ -25,37 +27,33 @@ MIN_INTERVAL_NS = 1000  # two lines with equal sample times would look like one
 
 FULL_READ_BYTES = 1024  # after a full read, the kernel may hold more data
 
-NO_STEPS: Motors = (0.0, 0.0, 0.0, 0.0)
 
-
-class Feedback(Struct, frozen=True, gc=False):
+class Line(Struct, frozen=True, gc=False):
     """A good line from the board, with its sample time and the motion since the previous good line.
 
-    `dt` and `gap` are times since the previous line, s: `gap` if the motion is unknown, else `dt`;
-    both are 0 in the first line. `turned` is the angle of each wheel by encoder counts, rad, valid
-    even after a gap.
+    `dt` and `gap` are times since the previous line: `gap` if the motion is unknown, else `dt`;
+    both are 0 in the first line. `turned` is the angle of each wheel by the board's counts, valid
+    even after a gap. `counted` is that of whole counts in the speeds (`whole_counts.py`), without
+    the time of `bridged`. Both are None if they are unknown.
     """
 
     at: Instant
     speeds: WheelSpeeds
-    dt: float
-    gap: float = 0.0
+    dt: Seconds
+    gap: Seconds = 0.0
     turned: Motors | None = None
-    # s of `dt` in which lines were lost. It comes first, and the odometry fills it.
-    bridged: float = 0.0
-    asked_ns: Ns | None = None  # when the answered command was written
-    since: float = 0.0  # s by the board's clock or arrivals, for plausibility; 0 after a gap
-    heard_ns: Ns = 0  # the host had the complete line
-    # Whole counts as angles, rad, without the time of `bridged` (`whole_counts.py`). None if the
-    # counts per turn are unknown or the firmware does not report whole counts.
+    # Of `dt`, in which lines were lost. It comes first, and the odometry fills it.
+    bridged: Seconds = 0.0
     counted: Motors | None = None
-    steps: Motors = NO_STEPS  # quantization of the speeds, rad/s; inf if unknown
-    count: float = 0.0  # rad of one encoder count; 0 if unknown
-    # From the previous sample to the end of the last command to move, s: the first line of zeros,
-    # or the board's watchdog. It is negative if that was before the sample.
-    driven: float = 0.0
-    jitter: float = 0.0  # mean error of `dt`, s
+    count: Rad = 0.0  # angle of one count; 0 if it is not declared
+    step: RadPerS = 0.0  # change of a speed that one count explains; inf if unknown
+    since: Seconds = 0.0  # by the board's clock or arrivals, for plausibility; 0 after a gap
+    # From the previous sample to the end of the last command to move: the first line of zeros, or
+    # the board's watchdog. It is negative if that was before the sample.
+    driven: Seconds = 0.0
     doubt: Motors | None = None  # angles by wrong counts, which earlier lines had too much, rad
+    asked_ns: Ns | None = None  # when the answered command was written
+    heard_ns: Ns = 0  # the host had the complete line
 
 
 class Timeline(Struct):
@@ -67,6 +65,8 @@ class Timeline(Struct):
     free_running: FreeRunning = field(default_factory=FreeRunning)
     prompted: Prompted = field(default_factory=Prompted)
     encoders: Encoders = field(default_factory=Encoders)
+    whole: WholeCounts = field(default_factory=WholeCounts)
+    coarse: CoarseEncoders = field(default_factory=CoarseEncoders)
     begun: bool = False  # a line was placed since `forget`
     read: Instant = Instant(0, 0)  # the last one
     end_ns: Ns = 0  # its last line was complete
@@ -84,6 +84,8 @@ class Timeline(Struct):
         self.free_running = FreeRunning()
         self.prompted = Prompted()
         self.encoders.forget()
+        self.whole = WholeCounts()
+        self.coarse.forget()
         self.counts_check = CountsCheck()
         self.begun = False
 
@@ -121,8 +123,8 @@ class Timeline(Struct):
         length: int,
         silent: bool,
         asked_ns: Ns | None = None,
-    ) -> Feedback:
-        """Return the feedback for the next line of the read, which must be a good one.
+    ) -> Line:
+        """Return the next line of the read, which must be a good one.
 
         `following` bytes of the read come after it, and `length` is its own with its end. `silent`
         says that it ends a silence, or is the first since the opening or a restart.
@@ -135,24 +137,27 @@ class Timeline(Struct):
         came_ns = self.heard_ns = came_ns if came_ns > before_ns else before_ns
         since = (came_ns - before_ns) / NS_PER_S
         if setup.period_ns:
-            placed = self.free_running.place(self.rest, setup.period_ns)
+            due_ns, dt_ns, bridged_ns = self.free_running.place(self.rest, setup.period_ns)
         else:
             if asked_ns is not None and not self.rest:
                 self.prompted.measure(self.end_ns - asked_ns, self.read_lines, setup.apart_ns)
-            placed = self.prompted.place(out, self.end_ns, asked_ns, setup.apart_ns)
-        dt, bridged, gap = placed.dt_ns / NS_PER_S, placed.bridged_ns / NS_PER_S, 0.0
+            due_ns, dt_ns, bridged_ns = self.prompted.place(
+                out, self.end_ns, asked_ns, setup.apart_ns
+            )
+        dt, bridged, gap = dt_ns / NS_PER_S, bridged_ns / NS_PER_S, 0.0
         known, turned, doubt, self.restarted = self.begun, None, None, False
         if bridged > 0.0:
             self.gaps += 1
         if reading is not None and setup.count:
-            counted = self._turned(setup, reading, came_ns)
-            if counted is not None:
+            by_board = self._turned(setup, reading, came_ns)
+            if by_board is not None:
                 check = self.counts_check
                 if not bridged:
-                    check.add(counted.motors, speeds.as_tuple(), counted.dt, setup.count)
+                    check.add(by_board.motors, speeds.as_tuple(), by_board.dt, setup.count)
                 if check.agrees:
-                    dt, bridged, since, known = counted.dt, 0.0, counted.dt, known and not silent
-                    turned = setup.codec.wheels(counted.motors)
+                    dt = since = by_board.dt
+                    bridged, known = 0.0, known and not silent
+                    turned = setup.codec.wheels(by_board.motors)
                 if check.doubt is not None:
                     doubt, check.doubt = setup.codec.wheels(check.doubt), None
         elif self.encoders.last is not None:
@@ -161,24 +166,37 @@ class Timeline(Struct):
             gap = 0.0 if last is None else max(since, dt)
             dt = bridged = since = 0.0
         self.begun = True
-        due_ns = placed.due_ns if placed.due_ns < came_ns else came_ns
+        elapsed, wheels, counted, count = dt - bridged, speeds.as_tuple(), None, 0.0
+        if setup.count and self.counts_check.agrees:
+            count = setup.count
+            step = count / elapsed if elapsed > 0.0 else 0.0
+            if turned is None and elapsed > 0.0 and setup.shows_counts:
+                # The time of a free-running board has no error.
+                jitter = 0.0 if setup.period_ns else int(self.prompted.jitter) / NS_PER_S
+                counted = self.whole.turned(count, wheels, elapsed, jitter, bridged)
+                if self.whole.covers_gap:
+                    bridged = 0.0
+            else:
+                self.whole.apart = 0.0
+        else:
+            step = self.coarse.step(wheels, elapsed)
+        due_ns = due_ns if due_ns < came_ns else came_ns
         # Pass the fields by position: creating a struct by its names takes three times as long.
-        return Feedback(
+        return Line(
             self._sampled(due_ns - wire_ns(length, setup.mcu.baud_rate)),
             speeds,
             dt,
             gap,
             turned,
             bridged,
-            asked_ns,
+            counted,
+            count,
+            step,
             0.0 if silent else since,
-            came_ns,
-            None,
-            NO_STEPS,
-            0.0,
             0.0 if last is None else (out.rest_ns - last.mono_ns) / NS_PER_S,
-            placed.jitter_ns / NS_PER_S,
             doubt,
+            asked_ns,
+            came_ns,
         )
 
     def _sampled(self, mono_ns: Ns) -> Instant:

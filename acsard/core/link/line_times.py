@@ -94,13 +94,9 @@ class Lateness(Struct):
         self.deviation += LAG_GAIN * ((-off if off < 0.0 else off) - self.deviation)
 
 
-class Placed(Struct, frozen=True, gc=False):
-    """The time of a line: when it was due here, and the times since the previous one, ns."""
-
-    due_ns: Ns
-    dt_ns: Ns = 0
-    bridged_ns: Ns = 0  # of `dt_ns`, in which lines were lost; it comes first
-    jitter_ns: Ns = 0  # mean error of `dt_ns`
+# The time of a line: when it was due here, the time since the previous one, and the part of that in
+# which lines were lost.
+Times = tuple[Ns, Ns, Ns]
 
 
 class FreeRunning(Struct):
@@ -158,11 +154,11 @@ class FreeRunning(Struct):
         else:
             self.line_ns, self.lost_ns = period, self.lost_ns + lost * period
 
-    def place(self, behind: int, period: Ns) -> Placed:
-        """Return the time of the next line of the last read, `behind` lines before its end."""
+    def place(self, behind: int, period: Ns) -> Times:
+        """Return the times of the next line of the last read, `behind` lines before its end."""
         took_ns = self.line_ns + self.lost_ns
         dt_ns, self.lost_ns = max(0, took_ns), min(0, took_ns)
-        return Placed(self.due_ns - behind * period, dt_ns, max(0, dt_ns - period))
+        return self.due_ns - behind * period, dt_ns, max(0, dt_ns - period)
 
     def skip(self) -> None:
         """Skip a line that is not used."""
@@ -226,8 +222,8 @@ class Prompted(Struct):
         if lines == 1 and narrow and abs(off) < 4 * deviation:
             self.own = off * period * (1.0 - (USB_JITTER_NS / jitter) ** 2)
 
-    def place(self, out: Output, end_ns: Ns, asked_ns: Ns | None, period: Ns) -> Placed:
-        """Return the time of the next reply, to the command of `asked_ns` if it says so."""
+    def place(self, out: Output, end_ns: Ns, asked_ns: Ns | None, period: Ns) -> Times:
+        """Return the times of the next reply, to the command of `asked_ns` if it says so."""
         waiting, given_up, before = out.open, out.given_up, self.sample_ns
         usual = self.least + self.lateness.usual * period
         if asked_ns is not None:
@@ -250,4 +246,4 @@ class Prompted(Struct):
         if given_up and before and given_up[-1].at_ns > self.answered:
             bridged_ns = min(max(given_up[-1].at_ns - before, 0), dt_ns)
         self.answered, self.sample_ns, self.own = command, sample_ns, 0.0
-        return Placed(sample_ns + int(usual), dt_ns, bridged_ns, int(self.jitter))
+        return sample_ns + int(usual), dt_ns, bridged_ns

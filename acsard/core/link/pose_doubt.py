@@ -2,7 +2,8 @@
 
 A plain line has no number and no counts. So the time of each line is known only to a few ms, and
 the wheels' angle in a lost line is guessed. With fine encoders, that costs some mm. With coarse
-ones, whose speed jumps from line to line, it costs metres.
+ones, whose speed jumps from line to line, it costs metres. If their counts are not declared, the
+heading drifts even without a loss.
 """
 
 from __future__ import annotations
@@ -12,16 +13,16 @@ from typing import Literal
 from msgspec import Struct
 
 from acsard.core.codes import PoseCode
+from acsard.core.link.coarse_encoders import JUMP_ANGLE
 from acsard.core.link.feedback import Timeline
 from acsard.core.link.line_times import NARROW_DEVIATION
 from acsard.core.link.link_setup import LinkSetup
-from acsard.core.link.quantization import COARSE_ANGLE
 
 WINDOW_LINES = 500  # 5 s at 100 Hz
 
 MAX_LOST_FRACTION = 0.01
 
-MIN_COARSE_LINES = 50  # of a window, if the counts per turn are not configured
+MIN_COARSE_LINES = 50  # of a window, if the counts per turn are not declared
 
 
 class PoseDoubt(Struct):
@@ -32,23 +33,24 @@ class PoseDoubt(Struct):
     coarse: int = 0
     due: int = WINDOW_LINES  # good lines at the next comparison
 
-    def judge(self, setup: LinkSetup, timeline: Timeline, lines: int, coarse_lines: int) -> bool:
-        """Judge the last `WINDOW_LINES`, and return whether the code has changed.
-
-        `coarse_lines` are those whose speeds have large steps, without configured counts per turn.
-        """
+    def judge(self, setup: LinkSetup, timeline: Timeline, lines: int) -> bool:
+        """Judge the last `WINDOW_LINES`, and return whether the code has changed."""
         if timeline.counts_check.wrong:
             before, self.code = self.code, "encoder_counts_wrong"
             return before != self.code
         passed = lines - self.lines
         if passed < WINDOW_LINES:
             return False
-        coarse = setup.count >= COARSE_ANGLE or coarse_lines - self.coarse >= MIN_COARSE_LINES
+        undeclared = timeline.coarse.lines - self.coarse >= MIN_COARSE_LINES
+        coarse = undeclared or setup.count >= JUMP_ANGLE
         lossy = timeline.gaps - self.gaps > MAX_LOST_FRACTION * passed
         # A free-running board has no delay that matters: its lines are a period apart.
         vague = timeline.prompted.lateness.deviation > NARROW_DEVIATION and not setup.period_ns
-        self.lines, self.gaps, self.coarse = lines, timeline.gaps, coarse_lines
+        self.lines, self.gaps, self.coarse = lines, timeline.gaps, timeline.coarse.lines
         self.due = lines + WINDOW_LINES
-        doubtful = coarse and (lossy or vague) and not setup.mcu.checked
-        before, self.code = self.code, "coarse_encoder" if doubtful else ""
+        before = self.code
+        if coarse and (lossy or vague) and not setup.mcu.checked:
+            self.code = "coarse_encoder"
+        else:
+            self.code = "encoder_counts_missing" if undeclared else ""
         return before != self.code

@@ -17,7 +17,7 @@ from acsard.core.link.board_status import STATUS, StatusReports
 from acsard.core.link.checked_line import Reading, seal, unseal
 from acsard.core.link.codec import FrameError
 from acsard.core.link.echo_check import QUESTION, WINDOW_NS, EchoCheck
-from acsard.core.link.feedback import Feedback, Timeline
+from acsard.core.link.feedback import Line, Timeline
 from acsard.core.link.lines import LineReader
 from acsard.core.link.link_diagnosis import SilenceDiagnosis
 from acsard.core.link.link_setup import LinkSetup
@@ -25,8 +25,8 @@ from acsard.core.link.link_state import GOOD_LINES, WATCHDOG_NS, WATCHDOG_S, Lin
 from acsard.core.link.link_state import State as LinkState
 from acsard.core.link.output import QUESTION_LINE, Output
 from acsard.core.link.pose_doubt import PoseDoubt
-from acsard.core.link.quantization import CountRecovery
 from acsard.core.link.step_times import StepTimes
+from acsard.core.link.whole_counts import MAX_DOUBT
 from acsard.core.values import (
     NS_PER_S,
     STILL,
@@ -78,7 +78,6 @@ class McuSession(Struct):
     rejects: dict[str, int] = {}  # by reason
     steps: StepTimes = field(default_factory=StepTimes)
     status: StatusReports = field(default_factory=StatusReports)
-    count_recovery: CountRecovery = field(default_factory=CountRecovery)
     doubt: PoseDoubt = field(default_factory=PoseDoubt)
     _lines: LineReader = field(default_factory=LineReader)
     _echo: EchoCheck = field(default_factory=EchoCheck)
@@ -111,7 +110,7 @@ class McuSession(Struct):
         port_open: bool,
         opened: int,
         received: tuple[Received, ...],
-    ) -> list[Feedback]:
+    ) -> list[Line]:
         """Process the state of the port and the received bytes, and return the good lines in order.
 
         `opened` counts the openings of the port.
@@ -124,7 +123,7 @@ class McuSession(Struct):
         if self.status.new or self.status.forgot:
             self.status.begin_update()
         now_ns, link, echo, until_ns = now.mono_ns, self._link, self._echo, 0
-        feedback: list[Feedback] = []
+        feedback: list[Line] = []
         if not port_open or opened != self._opened:
             self._begin(setup, out, port_open, opened, now_ns)
         if port_open:
@@ -216,6 +215,16 @@ class McuSession(Struct):
             return "plain"
         return "checked with samples" if self._sampled else "checked"
 
+    @property
+    def coarse_lines(self) -> int:
+        """Lines of coarse encoders whose counts are not declared."""
+        return self._timeline.coarse.lines
+
+    def encoder_counts(self, setup: LinkSetup) -> tuple[int, ...]:
+        """Return the declared counts per turn of each wheel; 0 if the speeds contradict them."""
+        agree = self._timeline.whole.doubt < MAX_DOUBT
+        return (setup.mcu.encoder_counts if agree else 0,) * 4
+
     def asks(self, at_ns: Ns) -> None:
         """Wait for the answer to the question, and count no line before it."""
         self._echo.asks(at_ns)
@@ -251,7 +260,6 @@ class McuSession(Struct):
 
     def _start_over(self, out: Output) -> None:
         self._timeline.forget()
-        self.count_recovery.forget()
         out.restart()
         self._echo.restart()
 
@@ -300,8 +308,7 @@ class McuSession(Struct):
         self._rejected.clear()
 
     def _judge_doubt(self, setup: LinkSetup) -> None:
-        coarse_lines = self.count_recovery.coarse_lines
-        changed = self.doubt.judge(setup, self._timeline, self.good_lines, coarse_lines)
+        changed = self.doubt.judge(setup, self._timeline, self.good_lines)
         if changed and self.doubt.code:
             why = sentence(self.doubt.code)
             self.events.append(Event("pose_doubtful", why.text, "warning", code=why.code))
@@ -325,7 +332,7 @@ class McuSession(Struct):
 
     # lines
 
-    def _decode(self, setup: LinkSetup, out: Output, piece: Received) -> list[Feedback]:
+    def _decode(self, setup: LinkSetup, out: Output, piece: Received) -> list[Line]:
         lines, timeline, feedback = self._lines.feed(piece.data), self._timeline, []
         link, data = self._link, piece.data
         for line, _ in lines:
@@ -383,7 +390,7 @@ class McuSession(Struct):
 
     def _line(
         self, setup: LinkSetup, out: Output, line: bytes, read_at: Instant, following: int
-    ) -> Feedback | None:
+    ) -> Line | None:
         if self._echo.trouble:
             self._reject(self._echo.trouble)
             self._link.reset_good_lines()
@@ -406,11 +413,10 @@ class McuSession(Struct):
         since_ns = self._link.good(at_ns, setup.quiet_ns)
         silent = since_ns is None or since_ns > setup.quiet_ns
         length = len(line) + 2
-        feedback = timeline.place(setup, out, speeds, reading, following, length, silent, asked_ns)
+        placed = timeline.place(setup, out, speeds, reading, following, length, silent, asked_ns)
         if setup.checked:
             self._check_samples(out, reading)
-        count = setup.count if timeline.counts_check.agrees else 0.0
-        return self.count_recovery.recover_counts(feedback, count, setup.shows_counts)
+        return placed
 
     def _refuse(self, setup: LinkSetup, line: bytes, error: FrameError) -> None:
         if error.reason == "repeated":

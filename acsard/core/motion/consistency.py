@@ -11,7 +11,7 @@ from msgspec import Struct, field
 
 from acsard.core.config.settings import FeedbackConfig, OdometryConfig
 from acsard.core.link.codec import Motors
-from acsard.core.link.feedback import Feedback
+from acsard.core.link.feedback import Line
 from acsard.core.motion.gyro import Gyro, Turn
 from acsard.core.motion.uncertainty import ErrorModel
 from acsard.core.motion.wheels import Wheels, new_wheels
@@ -36,7 +36,7 @@ class ConsistencyChecks(Struct):
         return self.gyro.status if odometry.gyro else GyroStatus()
 
     def check_line(
-        self, model: ErrorModel, line: Feedback, rolled: Motors, seconds: Seconds, *, known: bool
+        self, model: ErrorModel, line: Line, rolled: Motors, seconds: Seconds, *, known: bool
     ) -> None:
         """Check a line, and set `turn`, `slips` and `events`.
 

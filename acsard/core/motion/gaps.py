@@ -10,7 +10,7 @@ from __future__ import annotations
 from msgspec import Struct
 
 from acsard.core.link.codec import Motors
-from acsard.core.link.feedback import MAX_FILLED_GAP_S, Feedback
+from acsard.core.link.feedback import MAX_FILLED_GAP_S, Line
 from acsard.core.values import Seconds
 
 LONG_S = 0.06  # a line for more than this is judged like a gap
@@ -27,7 +27,7 @@ class Skipped(Struct):
     counted: Seconds = 0.0
     turned: Motors = AT_REST  # in `counted`, rad
 
-    def add(self, line: Feedback) -> None:
+    def add(self, line: Line) -> None:
         self.lines += 1
         if line.turned is None:
             self.lost += line.dt
@@ -46,7 +46,7 @@ class Rolled(Struct, frozen=True, gc=False):
     unknown: Seconds  # in addition to `seconds`
 
 
-def rolled_over(skipped: Skipped, line: Feedback, before: Motors) -> Rolled:
+def rolled_over(skipped: Skipped, line: Line, before: Motors) -> Rolled:
     """Return the angles since the last plausible line, which had the speeds `before`, rad/s."""
     speeds = _confirmed(before, line.speeds.as_tuple())
     if line.turned is not None:

@@ -16,7 +16,7 @@ import math
 from msgspec import Struct, field
 
 from acsard.core.link.codec import Motors
-from acsard.core.link.feedback import Feedback
+from acsard.core.link.feedback import Line
 from acsard.core.motion.consistency import ConsistencyChecks
 from acsard.core.motion.gaps import AT_REST, LONG_S, Rolled, Skipped, plus, rolled_over, times
 from acsard.core.motion.gyro import REST_S
@@ -70,7 +70,7 @@ class Odometry(Struct):
         self.uncertainty = Uncertainty.initial(model)
         self.was_set = True
 
-    def fold(self, line: Feedback, checks: ConsistencyChecks, model: ErrorModel) -> Estimate:
+    def fold(self, line: Line, checks: ConsistencyChecks, model: ErrorModel) -> Estimate:
         """Advance the pose by one plausible line, and return the new estimate.
 
         A gyro's turn replaces that of the wheels, which then give the distance, and the other wheel

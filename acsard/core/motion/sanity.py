@@ -5,7 +5,7 @@ several in a row are a fault. More than one in a hundred is a warning: damage on
 limit in `[feedback]` that is too low. A damaged plain line may look possible, and then the true
 ones look impossible. So a possible line is trusted only if it agrees with the one before it, and
 two later lines that agree outvote it. One count in a short time looks like a high speed, so a
-change may be larger by quantization steps, and speeds over the limit may add up to one count.
+change may be larger by two counts, and speeds over the limit may add up to one count.
 """
 
 from __future__ import annotations
@@ -15,9 +15,9 @@ from operator import sub
 
 from msgspec import Struct
 
+from acsard.core.link.coarse_encoders import COARSEST_COUNT, MIN_COUNT_S
 from acsard.core.link.codec import Motors
-from acsard.core.link.feedback import Feedback
-from acsard.core.link.quantization import COARSEST_COUNT, MIN_COUNT_S
+from acsard.core.link.feedback import Line
 from acsard.core.values import WHEELS, Event, RadPerS, WheelSpeeds
 
 FAULT_LINES = 3  # in a row: 30 ms at 100 Hz
@@ -68,7 +68,7 @@ class Sanity(Struct):
         """Whether the last `FAULT_LINES` lines were impossible, which latches a fault."""
         return self.count >= FAULT_LINES
 
-    def impossible(self, feedback: Feedback, fastest: RadPerS) -> str:
+    def impossible(self, feedback: Line, fastest: RadPerS) -> str:
         """Return why no wheel can have these speeds, or ""; `fastest` is `feedback.wheel_speed`.
 
         The allowed change grows with the time since the last possible line, so a real jump is
@@ -91,7 +91,6 @@ class Sanity(Struct):
         beyond = self.beyond  # an impossible line does not change it
         over = beyond is not NOT_FAST or max(map(abs, wheels)) > fastest
         if over or (sudden and change > self._most(self.since, longest)):
-            # Only few lines need the quantization steps.
             most = self._most(self.since, longest)
             why = self._too_fast(feedback, fastest)
             if not why and last is not None:
@@ -126,7 +125,7 @@ class Sanity(Struct):
         mean = (since + longest) / 2
         return MAX_WHEEL_ACCELERATION * (mean if mean > since else since) + SPEED_MARGIN
 
-    def _agrees(self, line: Feedback, longest: float) -> bool:
+    def _agrees(self, line: Line, longest: float) -> bool:
         return any(
             not self._jump(line, speeds, self._most(self.since - since, longest))
             for speeds, since in self.rejected
@@ -141,39 +140,39 @@ class Sanity(Struct):
             'supports mcu.link_check = "on" protects each line with a checksum'
         )
 
-    def _too_fast(self, line: Feedback, fastest: RadPerS) -> str:
+    def _too_fast(self, line: Line, fastest: RadPerS) -> str:
         turned, own = _proven(line), line.dt - line.bridged
         usual = max(own, MIN_COUNT_S)
-        # While other wheels rest, damaged lines of one wheel look like the steps of its encoder.
-        learned = max(line.steps) < math.inf
+        known = line.step < math.inf
         # The pose fills the time of the impossible lines before this one with its speeds.
         dropped_s = max(0.0, self.since - max(line.dt, line.since))
-        # Until the steps are learned, a line has one count of the coarsest encoder at most.
+        # While the encoders are unknown, a line has one count of the coarsest encoder at most.
         # A line without a known time moves nothing, so no count in it is excused.
         most = max(fastest, COARSEST_COUNT / usual if own > 0.0 else 0.0)
         beyond, speeds = list(self.beyond), line.speeds.as_tuple()
-        for wheel, (now, step) in enumerate(zip(speeds, line.steps, strict=True)):
-            size, time, count = abs(now), usual, min(step * usual, COARSEST_COUNT)
+        for wheel, now in enumerate(speeds):
+            size, time, count = abs(now), usual, min(line.step * usual, COARSEST_COUNT)
             if turned is not None:
                 count = line.count
                 if now and turned[wheel]:
                     time = abs(turned[wheel]) / size  # in which the board has counted
             over = beyond[wheel] = max(0.0, beyond[wheel] + (size - fastest) * (time + dropped_s))
-            if size > fastest and (over > count or not (learned or size <= most)):
+            if size > fastest and (over > count or not (known or size <= most)):
                 return f"{WHEELS[wheel]} at {now:.2f} rad/s is over feedback.wheel_speed"
         a, b, c, d = beyond
         self.beyond = (a, b, c, d) if any(beyond) else NOT_FAST
         return ""
 
-    def _jump(self, line: Feedback, before: WheelSpeeds, most: float) -> str:
+    def _jump(self, line: Line, before: WheelSpeeds, most: float) -> str:
         least = line.count / MIN_INTERVAL_S if _proven(line) is not None else 0.0
-        rows = zip(WHEELS, line.speeds.as_tuple(), before.as_tuple(), line.steps, strict=True)
-        for name, now, then, step in rows:
-            if abs(now - then) > most + COUNT_MARGIN * max(step, least):
+        most += COUNT_MARGIN * max(line.step, least)
+        rows = zip(WHEELS, line.speeds.as_tuple(), before.as_tuple(), strict=True)
+        for name, now, then in rows:
+            if abs(now - then) > most:
                 leap = f"{name} jumps from {then:.2f} to {now:.2f} rad/s"
                 return f"{leap}, which is over {MAX_WHEEL_ACCELERATION:g} rad/s2"
         return ""
 
 
-def _proven(line: Feedback) -> Motors | None:
+def _proven(line: Line) -> Motors | None:
     return line.counted if line.turned is None else line.turned
