@@ -11,7 +11,8 @@ step every 10 ms. A second process, the gateway, terminates TLS connections from
 
 `hear` updates the odometry from the feedback, chooses one command and checks that the mode allows
 it. `drive`, in each control period and at once for another speed, limits it and returns the line
-for the board. `sent` says which line really left. No other function decides how the robot moves.
+for the board. `sent` says which line really left, and `core/link/output.py` remembers it. No other
+function decides how the robot moves.
 
 Where to look: each package may import only the packages below it in this list.
 `pyproject.toml` states this order as contracts, and `lint-imports` checks the contracts.
@@ -52,7 +53,8 @@ Inside `core/`, in the same order:
     core/ros/        the two ROS transports: names, hashes, tokens, attachments, parameters
     core/messages/   the published structs, the table of keys, encodings, reports, schemas
     core/motion/     kinematics, odometry, consistency checks, arbiter, ages, limits, modes
-    core/link/       the serial line: codec, checksum, question, sample times, late steps, state
+    core/link/       the serial line: codec, checksum, question, output, sample times, late steps,
+                     state
     core/config/     turns acsard.toml into one frozen Config, or into errors that name the key
                      and the remedy
     core/values.py   the values in SI units: Instant, Twist, Pose, Command, Heard, News
