@@ -13,33 +13,23 @@ from contextlib import ExitStack
 from pathlib import Path
 
 from acsard.cli.common import add_config, load
-from acsard.core.config.named_faults import (
-    FAULTS,
-    INPUT_FAULTS,
-    RESET_FAULT,
-    NamedFault,
-    forms,
-    named,
-)
 from acsard.core.config.settings import Config
+from acsard.core.config.simulated_faults import FAULTS, form, parse
 from acsard.core.simulator.fake_mcu import FakeMcu
 from acsard.daemon.serial.simulator_pty import SimPty
 from acsard.host import clock
 from acsard.host.errors import UsageError
 
-# Arguments of faults, for the help.
-NUMBERS = {
-    "bias": "MOTOR:FACTOR",
-    "wrong_baud": "RATE",
-    "pushed": "M/S",
-    "stalls": "EVERY:SECONDS",
-    **dict.fromkeys(INPUT_FAULTS, "START:SECONDS"),
-    "bumper_pressed": "BUMPER:START:SECONDS",
-    "battery": "PERCENT:MINUTES",
-}
+# The words in capitals that the rows of the table do not explain.
+LEGEND = """\
+faults (MOTOR is a, b, c or d; START is the time in seconds until the fault begins, and SECONDS is
+its duration; 0 SECONDS means that it does not end):"""
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
+    parser.formatter_class = argparse.RawDescriptionHelpFormatter
+    rows = (f"  {form(name)}\n      {fault.text}" for name, fault in FAULTS.items())
+    parser.epilog = "\n".join((LEGEND, *rows))
     add_config(parser)
     parser.add_argument(
         "--fault",
@@ -47,13 +37,8 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         default=[],
         type=fault,
         metavar="NAME",
-        help="simulate the fault NAME; repeat the option for several faults. NAME alone: "
-        f"{', '.join(FAULTS)}. NAME with motors (a to d) or numbers: {', '.join(_with_names())}; "
-        "reset=SECONDS (the MCU restarts every SECONDS). START is the time in seconds until the "
-        "fault begins, and SECONDS is its duration; 0 SECONDS means that it does not end. EVERY is "
-        "the time in seconds from the start of one stall to the start of the next. "
-        "BUMPER is 1 to 4. The battery starts with PERCENT of its charge; a full battery lasts "
-        "MINUTES while the robot is at rest",
+        help="simulate the fault NAME, such as ftdi or bias=a:0.9, of the list of faults; repeat "
+        "the option for several faults",
     )
     parser.add_argument(
         "--link",
@@ -62,17 +47,13 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def _with_names() -> list[str]:
-    names = [form.partition("=")[::2] for form in forms()]
-    return [f"{name}={NUMBERS.get(name, kinds)}" for name, kinds in names]
-
-
-def fault(text: str) -> NamedFault:
-    """Parse a fault such as `bias=a:0.9`, as an argparse type."""
+def fault(text: str) -> str:
+    """Return a fault such as `bias=a:0.9`, as an argparse type."""
     try:
-        return named(text)
+        parse(text)
     except ValueError as error:
         raise argparse.ArgumentTypeError(f"{text}: {error}") from None
+    return text
 
 
 def main(args: argparse.Namespace) -> int:
@@ -99,15 +80,6 @@ def _remove_link(link: Path, device: str) -> None:
         link.unlink()
 
 
-def _reset_again(mcu: FakeMcu, period_s: float) -> None:
-
-    def reset() -> None:
-        mcu.reset(clock.now().mono_ns)
-        asyncio.get_running_loop().call_later(period_s, reset)
-
-    asyncio.get_running_loop().call_later(period_s, reset)
-
-
 async def _play(config: Config, args: argparse.Namespace) -> int:
     ended = asyncio.Event()
     for number in (signal.SIGTERM, signal.SIGINT):
@@ -115,17 +87,14 @@ async def _play(config: Config, args: argparse.Namespace) -> int:
     mcu = FakeMcu(config, clock.now().mono_ns)
     with ExitStack() as stack:
         for fault in args.fault:
-            if fault.name == RESET_FAULT:
-                _reset_again(mcu, fault.values[0])
-            else:
-                stack.enter_context(mcu.switched_on(fault))
+            stack.enter_context(mcu.fault(*parse(fault)))
         device = stack.enter_context(SimPty(mcu)).path
         if args.link:
             link = Path(args.link)
             _make_link(link, device)
             stack.callback(_remove_link, link, device)
         print(f"acsard run --port {args.link or device}", flush=True)
-        faults = ", ".join((*config.sim.faults, *map(str, args.fault))) or "none"
+        faults = ", ".join((*config.sim.faults, *args.fault)) or "none"
         print(f"simulated MCU on {device}, faults: {faults}; Ctrl-C ends it", file=sys.stderr)
         await ended.wait()
     print(f"the simulated MCU received {mcu.valid_lines} valid lines", file=sys.stderr)

@@ -116,7 +116,7 @@ class Run:
         # The board reports by its own clock, so that the daemon estimates the period, and counts
         # show.
         self.reports = ExitStack()
-        self.reports.enter_context(made.mcu.free_running(0.01))
+        self.reports.enter_context(made.mcu.fault("free_running", 0.01))
         made.run(1.5)
         made.drive(0.0, 0.0, 0.2)
         made.bus.wanted_keys = {"odom"}

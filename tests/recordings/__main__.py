@@ -39,7 +39,7 @@ def quiet(world: World) -> None:
 def stuck(world: World) -> None:
     """Stop a wheel's encoder. The pose leaves this wheel out, and it is reported as blocked."""
     world.drive(0.5, 0.0, 1.0)
-    with world.mcu.stuck_encoder(0):
+    with world.mcu.fault("stuck_encoder", 0):
         world.hold(0.5, 0.4, seconds=3.0)
 
 

@@ -3,21 +3,18 @@
 from __future__ import annotations
 
 import random
-from collections.abc import Callable
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 import msgspec
 
-from acsard.core.config.named_faults import FAULTS
 from acsard.core.config.parsing import effective
 from acsard.core.config.settings import Config
+from acsard.core.config.simulated_faults import FAULTS
 from acsard.core.config.toml_text import document
 from acsard.core.guard import Guard
 from acsard.core.robot import Robot
-from acsard.core.simulator.fake_mcu import FakeMcu
-from acsard.core.simulator.faults import Fault
 from acsard.core.values import Heard, Instant, Recording
 from acsard.recording.file import FrameWriter, Head, Steps, encode_steps, steps_of
 from acsard.recording.recorded_steps import FinishedStep, PlainStep, RecordedStep
@@ -120,15 +117,10 @@ def replayed(tape: Tape, config: Config, first: int = 0) -> Replay:
 INPUTS = {"estop", "bumpers"}
 """Faults after which the board no longer reports an input, which would keep the robot stopped."""
 
-
-def every_fault(mcu: FakeMcu) -> list[tuple[str, Callable[[], Fault]]]:
-    """Yield the name of each fault of the simulator, and a context manager that causes it."""
-    plain = [(name, getattr(mcu, name)) for name in FAULTS if name not in INPUTS]
-    cases = WITH_ARGUMENTS.items()
-    return plain + [
-        (name, lambda name=name, arguments=arguments: getattr(mcu, name)(*arguments))
-        for name, arguments in cases
-    ]
+CASES: dict[str, tuple[float, ...]] = {
+    name: () for name, fault in FAULTS.items() if not fault.arguments and name not in INPUTS
+} | WITH_ARGUMENTS
+"""The arguments of each fault of the simulator that a drive goes through."""
 
 
 def drive_through_faults(world: World, seconds: float, seed: int = 1) -> list[str]:
@@ -138,9 +130,9 @@ def drive_through_faults(world: World, seconds: float, seed: int = 1) -> list[st
     """
     dice, end_ns, had = random.Random(seed), world.now_ns + int(seconds * 1e9), []
     while True:
-        for name, fault in every_fault(world.mcu):
+        for name, arguments in CASES.items():
             world.drive(dice.uniform(-1.5, 1.5), dice.uniform(-3, 3), 0.4, hz=20.0)
-            with fault():
+            with world.mcu.fault(name, *arguments):
                 world.hold(dice.uniform(-1, 1), dice.uniform(-2, 2), seconds=0.5)
             if world.state.mode == "fault":
                 world.send(0.0)

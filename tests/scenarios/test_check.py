@@ -90,7 +90,7 @@ def test_old_firmware_is_never_driven_on_a_checked_link_and_the_reason_names_the
     firmware: str, comma: bool, boots: bool
 ) -> None:
     world = World(config("on", trailing_comma=comma))
-    with getattr(world.mcu, firmware)():
+    with world.mcu.fault(firmware):
         if boots:
             world.mcu.reset(world.now_ns)
         world.drive(0.5, seconds=9.0)
@@ -114,7 +114,7 @@ def test_bit_errors_both_ways_change_no_speed(every: int) -> None:
     world = started(config("on", 3200))
     world.drive(0.4, seconds=0.5)
     set_points: set[float] = set()
-    with world.mcu.bit_errors(every):
+    with world.mcu.fault("bit_errors", every):
         for _ in range(200):
             world.hold(0.4, seconds=0.01, hz=100.0)
             set_points.update(world.mcu.vehicle.set_points)
@@ -157,7 +157,7 @@ def test_a_pose_that_is_set_in_a_silence_of_the_board_is_in_its_covariance(
     """The counts that end the silence also have the motion from before the pose was set."""
     world = started(config(counts=3200))
     world.drive(0.8, 0.3, seconds=2.0)
-    with world.mcu.mute():
+    with world.mcu.fault("mute"):
         world.hold(0.8, 0.3, seconds=before)
         true = world.mcu.vehicle.pose
         assert world.call("set_pose", json.encode(true)).success
@@ -178,7 +178,7 @@ class Echo(FakeMcu):
     """A port without a microcontroller, which returns all bytes after 5 ms and `extra_delay_ns`."""
 
     def receive(self, now_ns: int, data: bytes) -> None:
-        self._schedule(now_ns + 5 * MS + self.extra_delay_ns, "sent", data)
+        self._schedule(now_ns + 5 * MS + self.switches.extra_delay_ns, "sent", data)
 
 
 @pytest.mark.variations(3)
@@ -193,7 +193,7 @@ def test_a_serial_line_that_echoes_is_never_driven(
 ) -> None:
     world = World(config(check, counts), plugged=False)
     echo = Echo(world.config, world.now_ns)
-    echo.extra_delay_ns, echo.latency_ns = delay_ms * MS, latency_ms * MS
+    echo.switches.extra_delay_ns, echo.switches.latency_ns = delay_ms * MS, latency_ms * MS
     world.port.plug(echo)
     world.run(0.3)
     world.drive(0.5, seconds=5.0)
@@ -226,9 +226,9 @@ class HalfDuplex(FakeMcu):
 def test_an_echo_beside_a_board_is_never_driven(period: float, latency_ms: int) -> None:
     world = World(Config(mcu=McuConfig(reply_period=period)), plugged=False)
     board = HalfDuplex(world.config, world.now_ns)
-    board.latency_ns = latency_ms * MS
+    board.switches.latency_ns = latency_ms * MS
     world.port.plug(board)
-    with board.free_running(period) if period else nullcontext():
+    with board.fault("free_running", period) if period else nullcontext():
         world.run(0.5)
         world.drive(0.5, seconds=2.0)
         assert (world.state.link, world.state.code) == ("booting", "echo")

@@ -92,14 +92,14 @@ def test_each_press_is_a_zero_line_within_a_period_and_no_release_moves_the_robo
 ) -> None:
     world, dice = World(), random.Random(PRESSES)
     watch, slowest_ns = Watch(world), 0
-    with world.mcu.estop():
+    with world.mcu.fault("estop"):
         world.run(0.5)
         for _ in range(PRESSES):
             watch.begin()
             into(world, mode)
             world.run(dice.uniform(0.0, 0.03))
             before = world.newest
-            with world.mcu.estop_pressed(0.0, 0.0):
+            with world.mcu.fault("estop_pressed", 0.0, 0.0):
                 world.run(0.05)
                 assert world.state.emergency_stop == "pressed"
                 assert world.state.mode == ("fault" if mode == "fault" else "stopped")
@@ -125,9 +125,9 @@ def test_a_cable_that_is_pulled_and_put_back_does_not_release_a_pressed_button(
     boot_s: float,
 ) -> None:
     world = World()
-    with world.mcu.estop():
+    with world.mcu.fault("estop"):
         world.run(0.3)
-        with world.mcu.estop_pressed(0.0, 0.0):
+        with world.mcu.fault("estop_pressed", 0.0, 0.0):
             world.run(0.1)
             world.port.unplug()
             world.run(1.0)
@@ -148,7 +148,7 @@ def test_a_new_board_without_a_button_does_not_keep_the_robot_stopped_for_ever(
     estop: EstopUse,
 ) -> None:
     world = World(Config(safety=SafetyConfig(estop=estop)))
-    with world.mcu.estop_pressed(0.0, 0.0), world.mcu.driver_fault(0.0, 0.0):
+    with world.mcu.fault("estop_pressed", 0.0, 0.0), world.mcu.fault("driver_fault", 0.0, 0.0):
         world.run(1.0)
     world.port.unplug()
     world.run(1.0)
@@ -179,14 +179,14 @@ def test_each_press_stops_the_robot_within_a_period_until_a_clear(
 ) -> None:
     world, dice = World(config), random.Random(PRESSES)
     watch, slowest_ns = Watch(world), 0
-    with world.mcu.bumpers():
+    with world.mcu.fault("bumpers"):
         world.run(0.5)
         for _ in range(PRESSES):
             number = dice.randint(1, 4)
             watch.begin()
             world.drive(*dice.choice(COMMANDS), seconds=0.5)
             world.run(dice.uniform(0.0, 0.03))
-            with world.mcu.bumper_pressed(number, 0.0, 0.0):
+            with world.mcu.fault("bumper_pressed", number, 0.0, 0.0):
                 world.run(0.05)
                 assert world.state.bumpers == [i == number for i in range(1, 5)]
                 assert world.state.code == "bumper"
@@ -204,10 +204,10 @@ def test_each_press_stops_the_robot_within_a_period_until_a_clear(
 def test_a_limiting_bumper_stops_the_robot_and_allows_only_a_slow_retreat(place: Place) -> None:
     """Each sender must send a zero first, and one that pushes does not drive on at the release."""
     world, away = World(AWAY), {"front": -1, "rear": 1}.get(place, 0)
-    with world.mcu.bumpers():
+    with world.mcu.fault("bumpers"):
         world.run(0.5)
         world.drive(0.5, seconds=1.0)
-        with world.mcu.bumper_pressed(PLACES.index(place) + 1, 0.0, 0.0):
+        with world.mcu.fault("bumper_pressed", PLACES.index(place) + 1, 0.0, 0.0):
             world.hold(0.5, seconds=0.2)
             assert world.lines()[-1].startswith(ZERO)
             assert world.state.code in ("bumper_away", "bumper_blocks")
@@ -261,7 +261,7 @@ def test_a_drained_battery_warns_and_then_stops_the_robot_until_it_is_charged() 
         "battery below battery.stop_below = 10 %: charge the battery to 10.5 %, then "
         "type `acsard call clear` again"
     )
-    with world.mcu.battery(90.0, 60.0):
+    with world.mcu.fault("battery", 90.0, 60.0):
         world.run(30.0)
         assert (level(world), world.state.mode) == ("ok", "stopped")
         assert world.call("clear").success

@@ -6,7 +6,6 @@ from contextlib import AbstractContextManager
 
 import pytest
 
-from acsard.core.config.named_faults import named
 from acsard.core.config.settings import Config, ControlConfig, McuConfig
 from tests.scenarios.world import World
 
@@ -27,7 +26,7 @@ def moving(lines: list[bytes]) -> list[bytes]:
 @pytest.mark.slow
 def test_a_silent_mcu_gets_zeros_only_at_ten_hertz(world: World) -> None:
     world.drive(0.5, seconds=1.0)
-    with world.mcu.mute():
+    with world.mcu.fault("mute"):
         world.hold(0.5, seconds=0.2)
         assert world.state.link == "stale"
         sent = len(world.port.sent)
@@ -39,7 +38,7 @@ def test_a_silent_mcu_gets_zeros_only_at_ten_hertz(world: World) -> None:
 
 def test_a_short_silence_only_ramps_up_again(world: World) -> None:
     world.drive(0.5, seconds=1.0)
-    with world.mcu.mute():
+    with world.mcu.fault("mute"):
         world.hold(0.5, seconds=0.5)
     world.hold(0.5, seconds=1.0)
     assert world.state.mode == "driving"
@@ -50,7 +49,7 @@ def test_a_board_that_is_silent_or_cannot_be_read_for_long_requires_neutral_agai
     world: World, fault: str
 ) -> None:
     world.drive(0.5, seconds=1.0)
-    with world.mcu.switched_on(named(fault)):
+    with world.mcu.fault(fault):
         world.hold(0.5, seconds=1.5)
         assert world.state.mode == "waiting"
         assert world.state.link == "stale"
@@ -74,7 +73,7 @@ def test_a_reset_mcu_does_not_move_before_neutral(world: World) -> None:
 
 def test_an_mcu_that_speaks_unprompted_at_ten_hertz_can_drive() -> None:
     world = World(Config(mcu=McuConfig(reply_period=0.1)))
-    with world.mcu.free_running(0.1):
+    with world.mcu.fault("free_running", 0.1):
         world.run(1.0)
         assert world.state.link == "up"
         world.drive(0.5, seconds=4.0)
@@ -85,7 +84,7 @@ def test_an_mcu_that_speaks_unprompted_at_ten_hertz_can_drive() -> None:
 
 def test_the_trailing_comma_option_reaches_the_last_wheel_of_a_comma_latched_mcu() -> None:
     world = World(Config(mcu=McuConfig(trailing_comma=True)))
-    latched: AbstractContextManager[None] = world.mcu.comma_latched()
+    latched: AbstractContextManager[None] = world.mcu.fault("comma_latched")
     with latched:
         world.run(0.2)
         world.drive(0.5, seconds=1.0)
@@ -99,7 +98,7 @@ def test_a_blocked_output_is_not_driving_and_requires_neutral_after_a_second(
     seconds: float,
 ) -> None:
     world = World(Config(mcu=McuConfig(reply_period=0.05)))
-    with world.mcu.free_running(0.05):
+    with world.mcu.fault("free_running", 0.05):
         world.run(0.5)
         world.drive(0.5, seconds=1.0)
         world.events.clear()

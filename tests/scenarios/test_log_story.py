@@ -213,19 +213,19 @@ def first_run(host: Host) -> None:
 
     host.drive()
     # damaged board
-    with host.world.mcu.reversed_encoder(1):
+    with host.world.mcu.fault("reversed_encoder", 1):
         host.hold(NAV, "nav", 0.5, 2.0)
     host.run(1.0)
     # the fault is cleared by anna
     host.call("clear", ANNA)
 
     host.drive()
-    with host.world.mcu.battery(50.0, 0.6):
+    with host.world.mcu.fault("battery", 50.0, 0.6):
         host.drive_until("warning")
         # low battery
         host.drive_until("stop")
     # empty battery
-    with host.world.mcu.battery(90.0, 600.0):
+    with host.world.mcu.fault("battery", 90.0, 600.0):
         host.run(8.0)
         # anna clears the stop after a charge
         host.call("clear", ANNA)

@@ -16,7 +16,7 @@ def driven(counts: int) -> World:
     """Return a robot with a free-running board that has driven at random and stopped."""
     mcu = McuConfig(reply_period=0.01)
     world, dice = World(Config(mcu=mcu, sim=SimConfig(encoder_counts=counts))), random.Random(4)
-    with world.mcu.free_running(0.01):
+    with world.mcu.fault("free_running", 0.01):
         world.run(0.5)
         for _ in range(4):
             world.drive(dice.choice((-1, 1)) * dice.uniform(0.3, 0.9), dice.uniform(-1, 1), 2.5)

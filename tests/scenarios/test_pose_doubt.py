@@ -82,7 +82,7 @@ def test_a_coarse_encoder_on_a_plain_link_that_loses_replies_advises_the_checked
     counts: int, configured: bool
 ) -> None:
     robot = world(counts, configured=None if configured else 0)
-    with robot.mcu.lost_replies(20):
+    with robot.mcu.fault("lost_replies", 20):
         drive(robot)
     assert robot.state.pose_doubt == "coarse_encoder"
     (event,) = [event for event in robot.events if event.name == "pose_doubtful"]
@@ -92,7 +92,7 @@ def test_a_coarse_encoder_on_a_plain_link_that_loses_replies_advises_the_checked
 @pytest.mark.parametrize("counts", [16, 96])
 def test_a_coarse_encoder_behind_an_adapter_of_16_ms_advises_the_checked_link(counts: int) -> None:
     robot = world(counts)
-    with robot.mcu.ftdi(0.016):
+    with robot.mcu.fault("ftdi", 0.016):
         drive(robot)
     assert robot.state.pose_doubt == "coarse_encoder"
 
@@ -112,11 +112,11 @@ def test_coarse_encoders_whose_counts_are_not_declared_advise_to_declare_them(
 
 
 def lost(robot: World) -> None:
-    robot.mcu.lose_reply = 20
+    robot.mcu.switches.lose_reply = 20
 
 
 def held(robot: World) -> None:
-    robot.mcu.latency_ns = 16_000_000
+    robot.mcu.switches.latency_ns = 16_000_000
 
 
 def nothing(robot: World) -> None:

@@ -34,7 +34,7 @@ class Square:
         self._counts, self._pose, self._before = counts, Pose(), [0] * 4
         self._dice, self._stalls, self._since = random.Random(seed), stalls, 0.0
         if link == "checked":
-            with world.mcu.no_sample():
+            with world.mcu.fault("no_sample"):
                 self._drive()
         else:
             self._drive()

@@ -35,7 +35,7 @@ def test_the_pose_of_a_pushed_robot_is_right_although_stop_lines_leave_late(link
 
     world.watch = watch
     world.run(1.0)
-    with world.mcu.pushed(1.0):
+    with world.mcu.fault("pushed", 1.0):
         for _ in range(5):
             world.stall_in_step(0.15)
             world.run(0.4)
@@ -90,7 +90,7 @@ def test_a_stall_in_a_gap_does_not_end_the_motion_in_the_pose_before_rest_is_com
     gap = Gap(0.5)
     if waiting:
         gap.world.stall(waiting)
-    with gap.world.mcu.mute() if mute else gap.world.mcu.lost_replies(1):
+    with gap.world.mcu.fault("mute") if mute else gap.world.mcu.fault("lost_replies", 1):
         gap.world.hold(0.5, seconds=commanded)
         gap.world.stall(stall)
         gap.world.run(0.6 - commanded - stall)
@@ -103,7 +103,7 @@ def test_a_stall_behind_the_command_to_rest_changes_nothing_in_the_pose() -> Non
     deviations = []
     for stall in (0.0, 0.3):
         gap = Gap(0.5)
-        with gap.world.mcu.mute():
+        with gap.world.mcu.fault("mute"):
             gap.world.hold(0.5, seconds=0.3)
             gap.world.stall(stall)
             gap.world.run(0.5 - stall)
@@ -122,7 +122,7 @@ def test_a_board_that_misses_the_command_to_rest_is_in_the_covariance(
     The covariance includes this additional distance.
     """
     gap = Gap(speed)
-    with gap.world.mcu.lost_commands(1):
+    with gap.world.mcu.fault("lost_commands", 1):
         gap.world.hold(speed, seconds=seconds)
     off, deviation = gap.end()
     assert abs(off) < 3 * deviation
@@ -139,12 +139,12 @@ def test_a_board_that_answered_late_before_loses_little_distance_with_its_replie
     the first three.
     """
     world = World(Config())
-    with world.mcu.slow_reply(0.03):
+    with world.mcu.fault("slow_reply", 0.03):
         world.run(1.0)
         world.drive(0.3, seconds=2.0)
     world.drive(0.3, seconds=after)
     begun = world.state.x
-    with world.mcu.lost_replies(every):
+    with world.mcu.fault("lost_replies", every):
         world.drive(0.3, seconds=4.0)
         assert world.state.x - begun == pytest.approx(1.2, abs=0.011)
 
@@ -169,7 +169,7 @@ def test_errors_of_many_equal_silences_add_up_within_the_covariance(
     for _ in range(8):
         with ExitStack() as fault_over, pytest.MonkeyPatch.context() as cable:
             if fault == "the board":
-                fault_over.enter_context(made.mcu.mute())
+                fault_over.enter_context(made.mcu.fault("mute"))
             else:
                 cable.setattr(made.port, "feed", lambda received: None)
             if fault == "all lines":

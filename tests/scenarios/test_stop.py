@@ -134,7 +134,7 @@ def call(
 
 def runaway(world: World) -> None:
     """Latch a fault: a person pushes the robot, so its wheels turn against the commanded zero."""
-    with world.mcu.pushed(0.5):
+    with world.mcu.fault("pushed", 0.5):
         world.run(2.5)
 
 
@@ -181,7 +181,7 @@ def test_the_state_shows_each_cause(world: World) -> None:
     assert (cause.kind, cause.code, cause.kept) == ("stop", "stopped", False)
     assert (cause.by, cause.text) == (f"{JOE} (native)", f"stopped by {JOE} (native)")
     world.run(1.0)
-    with world.mcu.bumpers(), world.mcu.bumper_pressed(1, 0.0, 0.0):
+    with world.mcu.fault("bumpers"), world.mcu.fault("bumper_pressed", 1, 0.0, 0.0):
         world.run(0.5)
     call(world, "deactivate", "ann")
     first, second = world.state.causes

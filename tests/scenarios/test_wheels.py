@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from contextlib import ExitStack
+from contextlib import AbstractContextManager, ExitStack
 from itertools import product
 
 import pytest
@@ -23,7 +23,6 @@ from acsard.core.motion.wheels import (
     FAULT_COUNTS,
     count_angle,
 )
-from acsard.core.simulator.faults import Fault
 from acsard.core.simulator.protocol import speeds_text
 from acsard.core.values import NS_PER_S, WHEELS, Received
 from tests.scenarios.world import World
@@ -39,7 +38,7 @@ def world() -> World:
 def damage(world: World, every: int, speeds: tuple[float, ...]) -> list[int]:
     """Replace each so-many-th line by one with these speeds; return a list of their number."""
     feed, seen, damaged = world.port.feed, 0, [0]
-    text = speeds_text(speeds, world.mcu.separator, False) + b"\r\n"
+    text = speeds_text(speeds, world.mcu.switches.separator, False) + b"\r\n"
 
     def fed(received: Received) -> None:
         nonlocal seen
@@ -64,9 +63,9 @@ def stopped(world: World) -> bool:
 @pytest.mark.parametrize("kind", ["reversed", "runaway"])
 def test_a_faulty_encoder_stops_the_robot_and_is_named(world: World, wheel: int, kind: str) -> None:
     world.drive(0.5, seconds=1.5)
-    faults: dict[str, Fault] = {
-        "reversed": world.mcu.bias(wheel, -1.0),
-        "runaway": world.mcu.bias(wheel, 2.0),
+    faults: dict[str, AbstractContextManager[None]] = {
+        "reversed": world.mcu.fault("bias", wheel, -1.0),
+        "runaway": world.mcu.fault("bias", wheel, 2.0),
     }
     with faults[kind]:
         world.hold(0.5, seconds=2.0)
@@ -89,13 +88,13 @@ def test_a_limit_below_one_count_of_an_encoder_hides_neither_the_way_nor_a_runaw
     mcu = McuConfig(reply_period=period, baud_rate=250000)
     feedback, sim = FeedbackConfig(wheel_speed=limit), SimConfig(encoder_counts=counts)
     world = World(Config(mcu=mcu, sim=sim, feedback=feedback, limits=limits))
-    with world.mcu.free_running(period):
+    with world.mcu.fault("free_running", period):
         world.run(0.5)
         world.drive(0.9, seconds=5.0)
         true = world.mcu.vehicle.pose.x
         assert world.state.x == pytest.approx(true, abs=0.1)
         if rolls_on:
-            with world.mcu.pushed(0.4):
+            with world.mcu.fault("pushed", 0.4):
                 world.hold(0.0, seconds=5.0)
             assert world.state.code == "wheel_runaway"
 
@@ -142,7 +141,7 @@ def test_wheels_with_few_counts_are_a_fault_only_if_they_are_too_fast(speeds_up:
     world.drive(0.1, seconds=2.0)
     with ExitStack() as faster:
         for wheel in range(4 * speeds_up):
-            faster.enter_context(world.mcu.bias(wheel, 1.6))
+            faster.enter_context(world.mcu.fault("bias", wheel, 1.6))
         world.hold(0.1, seconds=8.0)
     assert world.state.code == ("wheel_too_fast" if speeds_up else "commanded")
 
@@ -162,7 +161,7 @@ def test_wheels_turned_by_hand_are_reported_at_most_once_a_second_and_counted(
         world.call(verb)
     world.run(2.0)
     mode = world.state.mode
-    with world.mcu.pushed(0.12):
+    with world.mcu.fault("pushed", 0.12):
         world.run(4.0)
     assert world.state.mode == mode
     reports = len(event_texts(world, "uncommanded_motion"))
@@ -192,7 +191,7 @@ def test_a_robot_that_does_not_obey_a_stop_is_a_fault_as_soon_as_it_is_evident(
     within = ramp + max(FAULT_RESPONSES * config.feedback.response_time, rolls) + 2 * BLOCK_S
     world.drive(linear, seconds=2.0)
     began_ns = world.now_ns
-    with world.mcu.pushed(linear):
+    with world.mcu.fault("pushed", linear):
         if way == "stop":
             world.put("stop", b"")
         while world.state.mode != "fault" and world.now_ns - began_ns < 3 * NS_PER_S:
@@ -211,7 +210,7 @@ def test_a_robot_that_still_rolls_after_a_lost_link_is_a_runaway(world: World) -
     """
     world.drive(0.5, seconds=1.0)
     mcu = world.mcu
-    with mcu.no_watchdog(), mcu.pushed(0.5):
+    with mcu.fault("no_watchdog"), mcu.fault("pushed", 0.5):
         world.port.unplug()
         world.run(0.5)
         world.port.plug(mcu)

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import math
 import random
-from contextlib import ExitStack
+from contextlib import AbstractContextManager, ExitStack
+from functools import partial
 
 import pytest
+from msgspec.structs import replace
 
 from acsard.core.config.settings import (
     Config,
@@ -16,7 +18,6 @@ from acsard.core.config.settings import (
     SimConfig,
 )
 from acsard.core.messages.schema import DiagnosticArray, DiagnosticStatus
-from acsard.core.simulator.faults import Fault
 from acsard.core.values import WHEELS
 from tests.scenarios.imperfect_gyro import ImperfectGyro
 from tests.scenarios.world import World
@@ -53,11 +54,11 @@ def row(made: World) -> DiagnosticStatus:
     return row_status
 
 
-def encoder_fault(made: World, kind: str, wheel: int) -> Fault:
+def encoder_fault(made: World, kind: str, wheel: int) -> AbstractContextManager[None]:
     return {
-        "dead": made.mcu.stuck_encoder(wheel),
-        "reversed": made.mcu.bias(wheel, -1.0),
-        "stuck": made.mcu.frozen_encoder(wheel),
+        "dead": made.mcu.fault("stuck_encoder", wheel),
+        "reversed": made.mcu.fault("bias", wheel, -1.0),
+        "stuck": made.mcu.fault("frozen_encoder", wheel),
     }[kind]
 
 
@@ -103,7 +104,7 @@ def test_with_one_wheel_fault_the_pose_stays_right_and_state_names_the_wheel(
 def test_with_a_gyro_and_a_wheel_fault_heading_and_distance_stay_right() -> None:
     made = world(ImperfectGyro(bias=0.01), SimConfig(track_multiplier=1.6))
     made.drive(0.4, 0.8, seconds=3.0)
-    with made.mcu.stuck_encoder(0):
+    with made.mcu.fault("stuck_encoder", 0):
         made.hold(0.4, 0.8, seconds=3.0)
         made.send(0.0)
         made.run(1.0)
@@ -138,7 +139,7 @@ def test_a_big_robot_that_responds_late_and_falls_short_is_a_warning(
         dice = random.Random(seed)
         made = World(Config(limits=limits, sim=SimConfig(motor_time_constant=lag)))
         made.run(1.0)
-        with made.mcu._with(drives=[reaches] * 4):
+        with made.mcu.switched(partial(replace, drives=(reaches,) * 4)):
             made.send(0.0)
             made.run(0.1)
             for _ in range(6):
@@ -153,7 +154,7 @@ def test_a_wheel_that_is_ignored_as_dead_leaves_the_turn_rate_uncertain() -> Non
     """The wheel may be blocked instead, and then the robot turns, but its odometry does not."""
     made = world()
     made.drive(0.8, seconds=1.0)
-    with made.mcu.dead_motor(0):
+    with made.mcu.fault("dead_motor", 0):
         made.hold(0.8, seconds=0.4)
         before = made.mcu.vehicle.pose.yaw
         made.hold(0.8, seconds=0.1)
@@ -180,8 +181,7 @@ def test_a_wheel_that_may_be_right_although_it_is_ignored_is_in_the_covariance(
                 mcu, "_speeds", lambda now, read=mcu._speeds: [0.0, *read(now)[1:3], 0.0]
             )
         else:
-            fault = made.mcu.dead_motor if kind == "dead motor" else made.mcu.reversed_motor
-            faults.enter_context(fault(0))
+            faults.enter_context(made.mcu.fault(kind.replace(" ", "_"), 0))
         made.hold(linear, angular, seconds=1.0)
         made.run(1.0)
     error, std = off(made)[1] - before, math.sqrt(made.odom.pose.covariance[35])

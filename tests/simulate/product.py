@@ -11,10 +11,12 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack, suppress
+from functools import partial
 from itertools import repeat
 from typing import Any
 
 import msgspec
+from msgspec.structs import replace
 
 import acsard
 from acsard.core.config.parsing import ConfigError, parse
@@ -438,16 +440,17 @@ class Product:
         mcu, bauds = self._world.mcu, [values[0] for name, values in faults if name == "wrong_baud"]
         for name, values in faults:
             if name == "endless":
-                self._lasting.enter_context(mcu._with(ending=""))
+                self._lasting.enter_context(mcu.switched(partial(replace, ending="")))
                 continue
             if name == "constant_answers":
-                self._lasting.enter_context(mcu._with(_processing=repeat(values[0])))
+                self._lasting.callback(setattr, mcu, "_processing", mcu._processing)
+                vars(mcu)["_processing"] = repeat(values[0])
                 continue
             if name in ("half_duplex", "runaway", "set_points", "gain", "replies_twice"):
                 continue
             # The daemon's TX is joined to its RX, so nothing of the board arrives.
             fault = "mute" if name == "echo" else name
-            self._lasting.enter_context(getattr(mcu, fault)(*values))
+            self._lasting.enter_context(mcu.fault(fault, *values))
         self._garble(mcu, bauds[-1] if bauds else self._config.mcu.baud_rate)
         self.echo = any(name == "echo" for name, _ in faults)
         for name, values in faults:
@@ -458,7 +461,7 @@ class Product:
             if name == "replies_twice":
                 self._reply_twice(mcu)
             if name == "gain":
-                self._lasting.enter_context(mcu._with(drives=[values[0]] * 4))
+                self._lasting.enter_context(mcu.switched(partial(replace, drives=(values[0],) * 4)))
         self._run_away(mcu, [values[0] for name, values in faults if name == "runaway"])
 
     def _garble(self, mcu: FakeMcu, baud_rate: int) -> None:

@@ -188,6 +188,8 @@ def _helps(command: argparse.ArgumentParser, path: str) -> Iterator[str]:
         rows.append((f"`{named}{value}`", _literal(_help(action))))
     if rows:
         yield table(("argument", "meaning"), rows)
+    if command.epilog and path:
+        yield f"```text\n{command.epilog}\n```\n"
     for subparser in subparsers:
         for name, child in subparser.choices.items():
             yield from _helps(child, f"{path} {name}")

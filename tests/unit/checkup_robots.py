@@ -15,8 +15,8 @@ import msgspec
 from acsard.checkup import checkup_report, procedure
 from acsard.checkup.board import Board
 from acsard.checkup.findings import Finding
-from acsard.core.config.named_faults import named
 from acsard.core.config.settings import Config
+from acsard.core.config.simulated_faults import parse
 from acsard.core.simulator.fake_mcu import FakeMcu
 from acsard.core.simulator.virtual_wire import VirtualWire
 
@@ -57,7 +57,7 @@ class Robot(VirtualWire):
     def faulty(self) -> Iterator[None]:
         with ExitStack() as stack:
             for text in self.faults:
-                stack.enter_context(self.mcu.switched_on(named(text)))
+                stack.enter_context(self.mcu.fault(*parse(text)))
             yield
 
     @contextmanager
@@ -168,10 +168,8 @@ class Person(Nobody):
         self._robot.turned.clear()
         for name, number in self.presses.items():
             if text.startswith(f"press the {name} and"):
-                mcu, times = self._robot.mcu, (2.0, 0.5)
-                self._pressed.enter_context(
-                    mcu.bumper_pressed(number, *times) if number else mcu.estop_pressed(*times)
-                )
+                name, *place = ("bumper_pressed", number) if number else ("estop_pressed",)
+                self._pressed.enter_context(self._robot.mcu.fault(name, *place, 2.0, 0.5))
 
     def ask(self, question: str, answers: Sequence[str]) -> str | None:
         assert not any(abs(v) > 0.5 for v in self._robot.mcu.vehicle.speeds), "asked at speed"

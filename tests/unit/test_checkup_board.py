@@ -19,7 +19,7 @@ def test_a_motor_that_zeros_do_not_stop_ends_the_check() -> None:
         def send(self, data: bytes) -> None:
             super().send(data)
             if self.mcu.vehicle.speeds[0] > 2.0:
-                self.mcu.understand = lambda line: None
+                vars(self.mcu)["understand"] = lambda line: None
 
     robot = Deaf("no_watchdog", "free_running")
     with robot.board() as board:
@@ -40,7 +40,7 @@ def test_silence_ends_the_check_only_during_a_drive() -> None:
     with robot.board() as board:
         board.listen(5.0)
         board.drive(ZERO, 0.2)
-        with robot.mcu.mute(), pytest.raises(StoppedError) as end:
+        with robot.mcu.fault("mute"), pytest.raises(StoppedError) as end:
             board.drive((SPEED, 0.0, 0.0, 0.0), 2.0)
     assert end.value.finding.name == "link"
     assert "while it had to turn motor a" in end.value.finding.text
@@ -56,7 +56,7 @@ def test_motors_that_turn_alone_but_not_together_end_the_check() -> None:
 
     robot = Robot("plain_only")
     with robot.board() as board:
-        robot.mcu.understand = gives_in
+        vars(robot.mcu)["understand"] = gives_in
         assert turn(board, 0, 3.0)[0][0] == pytest.approx(3.0, abs=0.1)
         board.stop_motors()
         with pytest.raises(StoppedError) as end:

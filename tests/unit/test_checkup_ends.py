@@ -214,14 +214,15 @@ class Regulates(Robot):
         super().__init__(*faults, config=Config(sim=SimConfig(motor_time_constant=lag)))
         self.full_s = 0.0
         """Time for which a motor was faster than 6 rad/s, in seconds."""
-        self.mcu.understand = self._regulated
+        self.mcu.switches.firmware = "plain_only"
+        vars(self.mcu)["understand"] = self._regulated
 
     def _regulated(self, line: bytes) -> protocol.Command | None:
         command = protocol.reference(line)
         if command is None:
             return None
         for motor, target in command.values.items():
-            sign = 0 if self.mcu.stuck == motor else self.mcu.encoder_signs[motor]
+            sign = 0 if self.mcu.switches.stuck == motor else self.mcu.switches.encoder_signs[motor]
             speed = self.mcu.vehicle.speeds[motor]
             error = target - sign * speed
             if sign != 1 and abs(error) > 0.1:

@@ -134,10 +134,9 @@ def test_a_later_step_reports_a_fault_that_an_earlier_step_could_not_judge() -> 
                 robot.looked = text.startswith("testing whether lines")
 
     robot = Refuses("plain_only", late_s=0.05, every=3)
-    robot.mcu.understand = obeys
+    vars(robot.mcu)["understand"] = obeys
     findings: list[Finding] = []
     with robot.faulty():
-        robot.mcu.understand = obeys
         procedure.run(robot, Sees(), robot.config, findings.append)
     matches = [finding for finding in findings if finding.name == "trailing comma"]
     assert [finding.figure for finding in matches] == ["not judged", "needed"]

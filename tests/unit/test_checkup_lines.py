@@ -102,7 +102,7 @@ def test_a_watchdog_time_within_the_contract_is_measured_and_passes(
     kind: tuple[str, ...], time_ms: int, robot: type[Robot]
 ) -> None:
     instance = robot(*kind)
-    instance.mcu.watchdog_ns = time_ms * 1_000_000
+    instance.mcu.switches.watchdog_ns = time_ms * 1_000_000
     verdict, figure = measured(instance)
     value, _, about = figure.partition(" ms")
     assert int(value) == pytest.approx(time_ms, abs=60 if about else 20)
@@ -111,7 +111,7 @@ def test_a_watchdog_time_within_the_contract_is_measured_and_passes(
 
 def test_a_watchdog_too_short_for_any_host_is_a_warning() -> None:
     robot = Robot()
-    robot.mcu.watchdog_ns = 40_000_000
+    robot.mcu.switches.watchdog_ns = 40_000_000
     assert measured(robot)[0] == "WARN"
 
 
@@ -131,7 +131,7 @@ def test_a_time_measured_too_coarsely_to_judge_does_not_pass(
     fault: tuple[str, ...], per_turn: int, time_s: float
 ) -> None:
     robot = Robot(*fault, config=Config(sim=SimConfig(encoder_counts=per_turn)))
-    robot.mcu.watchdog_ns = int(time_s * 1e9)
+    robot.mcu.switches.watchdog_ns = int(time_s * 1e9)
     verdict, figure = measured(robot)
     middle, _, about = figure.removesuffix(" ms").partition(" ms ± ")
     assert int(middle) == pytest.approx(1000 * time_s, abs=int(about) + 15)
@@ -157,7 +157,7 @@ def run_earlier_steps(board: Board) -> None:
 @pytest.mark.parametrize("way", ["lose_reply", "lose_command"])
 def test_a_loss_of_more_than_two_percent_fails(way: str, every: int, verdict: str) -> None:
     robot = Robot()
-    setattr(robot.mcu, way, every)
+    setattr(robot.mcu.switches, way, every)
     with robot.board() as board:
         run_earlier_steps(board)
         assert line_loss.finding(board).verdict == verdict

@@ -124,7 +124,7 @@ def test_a_board_that_does_not_come_back_is_reported() -> None:
 
         def listen(self, until_ns: int) -> list[tuple[int, bytes]]:
             if not self.dead and self.now_ns() >= 6_000 * MS:
-                self.dead, self.mcu.muted = True, True
+                self.dead, self.mcu.switches.muted = True, True
                 self.mcu.reset(self.now_ns(), 100 * MS)
             return super().listen(until_ns)
 

@@ -102,12 +102,12 @@ def days(where: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     world.drive(0.5, seconds=0.5)
     world.stall(0.6)
     world.run(1.0)
-    with world.mcu.mute():
+    with world.mcu.fault("mute"):
         world.run(0.05)
         world.stall(0.2)
         world.run(0.05)
     world.run(1.0)
-    with world.mcu.mute():
+    with world.mcu.fault("mute"):
         world.run(0.5)
         identity = b"!acsard-mcu 1 counts=3200 check=1 sample=1 lines=0 reset=brown-out\r\n"
         world.port.feed(Received(world.instant, identity))

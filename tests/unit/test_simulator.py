@@ -263,7 +263,7 @@ def test_a_line_is_answered_at_its_virtual_time_and_garbled_at_a_wrong_baud_rate
     wire.open(57600)
     wire.send(ZERO)
     assert wire.listen(70_000_000) == []
-    with mcu.wrong_baud(57600):
+    with mcu.fault("wrong_baud", 57600):
         wire.send(b"\r\n" + ZERO)
         assert wire.listen(120_000_000)[0][1] == ZERO
     wire.close()

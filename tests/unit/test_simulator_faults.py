@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from contextlib import AbstractContextManager, ExitStack, suppress
+from contextlib import ExitStack, suppress
 from itertools import pairwise
-from operator import methodcaller
 from typing import Any
 
-from acsard.core.config.named_faults import ARGUMENTS, FAULTS, named
 from acsard.core.config.settings import Config, SimConfig
+from acsard.core.config.simulated_faults import FAULTS, parse
 from acsard.core.simulator.fake_mcu import MS, RESET_NS, FakeMcu
-from acsard.core.simulator.faults import Faults
 from tests.each import each
 from tests.unit.test_simulator import (
     LINE,
@@ -25,13 +22,13 @@ from tests.unit.test_simulator import (
 
 SEALED = LINE[:-2] + b"#07S*EE6B\r\n"
 
-
-Fault = Callable[[FakeMcu], AbstractContextManager[None]]
-
-NAMED: Mapping[str, Fault] = {name: methodcaller(name) for name in FAULTS} | {
-    "bias": methodcaller("bias", 2, 1.5), "stuck_encoder": methodcaller("stuck_encoder", 1),
-    "frozen_encoder": methodcaller("frozen_encoder", 2),
-}  # fmt: skip
+# Faults that a user writes without arguments, and three others, with their arguments.
+CASES: dict[str, tuple[float, ...]] = {
+    **{name: () for name, fault in FAULTS.items() if not fault.arguments},
+    "bias": (2, 1.5),
+    "stuck_encoder": (1,),
+    "frozen_encoder": (2,),
+}
 
 
 def story(mcu: FakeMcu, start_ns: int) -> tuple[Heard, list[float], list[float]]:
@@ -44,12 +41,12 @@ def story(mcu: FakeMcu, start_ns: int) -> tuple[Heard, list[float], list[float]]
     return at, list(mcu.vehicle.angles), list(mcu.vehicle.set_points)
 
 
-@each("fault", NAMED.values())
-def test_a_fault_changes_the_behaviour_and_ends_with_its_block(fault: Fault) -> None:
+@each("name", CASES)
+def test_a_fault_changes_the_behaviour_and_ends_with_its_block(name: str) -> None:
     faulty, sound, mended = FakeMcu(TRUE), FakeMcu(TRUE), FakeMcu(TRUE)
-    with fault(faulty):
+    with faulty.fault(name, *CASES[name]):
         assert story(faulty, 0) != story(FakeMcu(TRUE), 0)
-    with suppress(KeyError), fault(mended):
+    with suppress(KeyError), mended.fault(name, *CASES[name]):
         drive(mended, 0, 4, ZERO)
         replies(mended, 250 * MS)
         raise KeyError
@@ -79,7 +76,7 @@ def test_a_fault_of_the_report_does_not_change_the_motion(
     mcu = FakeMcu(TRUE)
     with ExitStack() as on:
         for name, *arguments in faults:
-            on.enter_context(getattr(mcu, name)(*arguments))
+            on.enter_context(mcu.fault(name, *arguments))
         chunks = drive(mcu, 0, 6)
     assert [data for _, data in chunks[-1:]] == ([] if reply is None else [reply])
     assert mcu.vehicle.set_points == SPEEDS
@@ -97,51 +94,58 @@ def test_a_fault_of_the_report_does_not_change_the_motion(
 )
 def test_a_comma_latched_board_takes_wheels_at_commas(line: bytes, set_points: list[float]) -> None:
     mcu = FakeMcu(TRUE)
-    with mcu.comma_latched():
+    with mcu.fault("comma_latched"):
         drive(mcu, 0, 1, line)
         assert mcu.vehicle.set_points == set_points
 
 
 def test_a_free_running_board_reports_by_its_own_clock_unpadded_and_with_a_comma() -> None:
     mcu = FakeMcu(TRUE)
-    with mcu.free_running(0.1):
+    with mcu.fault("free_running", 0.1):
         chunks = drive(mcu, 0, 40, b"ap02.50,bn08.75,cp15.00,dp00.00\r\n")
         assert {data for _, data in chunks[1:]} == {b"ap2.50,bn8.75,cp15.00,dp0.00,\r\n"}
         assert [b[0] - a[0] for a, b in pairwise(chunks)] == [100 * MS] * 2
         mcu.reset(400 * MS)
         assert b"," not in mcu.advance(400 * MS + RESET_NS)
-    with mcu.free_running(0.1):  # entered twice, it is not twice as fast
+    with mcu.fault("free_running", 0.1):  # entered twice, it is not twice as fast
         assert 9 <= mcu.advance(1400 * MS + RESET_NS).count(b"ap0.00") <= 10
 
 
 # The switches.
 
 
-def switches(faults: Faults) -> dict[str, object]:
-    return {k: v for k, v in vars(faults).items() if not k.startswith("_")}
-
-
 def test_a_bit_error_flips_one_bit_and_a_different_one_each_time() -> None:
-    faults, data = Faults(), bytes(40)
-    with faults.bit_errors(every=1):
-        turned = [int.from_bytes(faults._damaged(data), "big") for _ in range(320)]
+    mcu, data = FakeMcu(TRUE), bytes(40)
+    with mcu.fault("bit_errors", 1):
+        turned = [int.from_bytes(mcu._damaged(data), "big") for _ in range(320)]
     assert all(number.bit_count() == 1 for number in turned)
     assert len(set(turned)) == 320
-    assert faults._damaged(data) == data
+    assert mcu._damaged(data) == data
 
 
-EXAMPLE = {"m": "b", "mm": "b:c", "mn": "b:2", "n": "9600", "nn": "5:0.1", "nnn": "1:5:2"}
-EACH = (*FAULTS, *(f"{name}={EXAMPLE[kinds]}" for name, kinds in ARGUMENTS.items()))
+EXAMPLES = {
+    "MOTOR": "b", "MOTOR:MOTOR": "b:c", "MOTOR:FACTOR": "b:2", "RATE": "9600", "M/S": "1",
+    "EVERY:SECONDS": "5:0.1", "START:SECONDS": "5:0.1", "BUMPER:START:SECONDS": "1:5:2",
+    "PERCENT:MINUTES": "5:0.1", "SECONDS": "5",
+}  # fmt: skip
 
 
-def test_each_fault_can_be_turned_on_and_off_and_is_on_at_the_start_if_configured() -> None:
-    mcu = FakeMcu(Config())
+@each("name", FAULTS)
+def test_each_fault_can_be_turned_on_and_off_and_is_on_at_the_start_if_configured(
+    name: str,
+) -> None:
+    arguments = FAULTS[name].arguments
+    text = f"{name}={EXAMPLES[arguments]}" if arguments else name
+    mcu, configured = FakeMcu(Config()), FakeMcu(Config(sim=SimConfig(faults=(text,))))
     before = dict(vars(mcu))
-    for text in EACH:
-        configured = FakeMcu(Config(sim=SimConfig(faults=(text, "ftdi"))))
-        with mcu.switched_on(named(text)):
-            assert vars(mcu) != before, text
-            for switch in switches(Faults()).keys() - {"latency_ns"}:
-                assert getattr(configured, switch) == getattr(mcu, switch), (text, switch)
-        assert vars(mcu) == before, text
-        assert configured.latency_ns == 16_000_000
+    with mcu.fault(*parse(text)):
+        assert mcu.switches != before["switches"]
+        assert configured.switches == mcu.switches
+    assert vars(mcu) == before
+
+
+def test_a_board_with_resets_starts_again_and_again() -> None:
+    mcu = FakeMcu(Config())
+    with mcu.fault("reset", 5):
+        boots = [mcu.advance(s * 1000 * MS).count(b"boot") for s in range(1, 22)]
+    assert boots == [i % 5 == 1 and i > 1 for i in range(1, 22)]

@@ -1,7 +1,7 @@
 """Checks combinations of settings in a configuration.
 
 `contradictions` are errors, `warnings` an effect that a user may not expect. `motion_rules.py` has
-the rules about motion, `named_faults.py` those about simulated faults.
+the rules about motion, `simulated_faults.py` those about simulated faults.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from collections.abc import Callable
 from itertools import pairwise
 from typing import get_args
 
-from acsard.core.config import motion_rules, named_faults
+from acsard.core.config import motion_rules, simulated_faults
 from acsard.core.config.partial import Rule, mistakes
 from acsard.core.config.settings import HYSTERESIS, SIMULATOR, Baud, Config, McuConfig, is_tls
 from acsard.core.config.validation import show
@@ -115,7 +115,7 @@ def warnings(config: Config) -> list[str]:
             'ros.namespace = "" on a bus that other machines reach: a second robot on this bus '
             "would use the same ROS topics; give each robot its own namespace"
         )
-    return messages + named_faults.warnings(config)
+    return messages + simulated_faults.warnings(config)
 
 
 def _count_warnings(config: Config) -> list[str]:
@@ -440,7 +440,7 @@ RULES: tuple[Rule, ...] = (
     _page_problems,
     _access_problems,
     _ros_problems,
-    *named_faults.RULES,
+    *simulated_faults.RULES,
 )
 
 LIVE_RULES: tuple[Rule, ...] = (_rate_problems, *motion_rules.RULES, _source_problems)

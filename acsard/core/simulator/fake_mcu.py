@@ -1,7 +1,8 @@
 """Simulates the board: its side of the serial protocol, with the time of each byte on the wire.
 
 It does not use the daemon's parser, so an error there makes tests fail. A test switches a fault on
-for a `with` block, such as `with mcu.mute():` (`faults.py`); those of `[sim] faults` are always on.
+for a `with` block, such as `with mcu.fault("mute"):`. Those of `[sim] faults` are always on. The
+table of the faults is `core/config/simulated_faults.py`.
 """
 
 from __future__ import annotations
@@ -9,16 +10,23 @@ from __future__ import annotations
 import heapq
 import math
 from collections import deque
-from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, ExitStack, contextmanager
 from itertools import count, cycle
 
-from acsard.core.config.named_faults import named
+from msgspec.structs import replace
+
 from acsard.core.config.settings import Config, WheelMap
+from acsard.core.config.simulated_faults import (
+    FAULTS,
+    NEVER_NS,
+    Battery,
+    Clock,
+    Switches,
+    parse,
+)
 from acsard.core.config.wire_time import wire_ns
 from acsard.core.simulator import protocol
-from acsard.core.simulator.faults import USB_PACKET, Fault, Faults
-from acsard.core.simulator.faults import WATCHDOG_NS as WATCHDOG_NS
 from acsard.core.simulator.vehicle import Vehicle
 from acsard.core.values import NS_PER_S, Ns
 
@@ -31,31 +39,34 @@ MIN_WINDOW_NS = 4 * MS
 
 OUTPUT_BYTES = 255  # bytes; a line that does not fit is dropped, as by `deploy/firmware`
 
-STATUS_NS = NS_PER_S // 10
+USB_PACKET = 62  # bytes; an FTDI adapter sends a full packet without waiting for its timer
 
 # Six cells: V of the empty battery, additional V of a full one, ohm.
 EMPTY_VOLTS, CHARGED_VOLTS, RESISTANCE = 21.0, 4.2, 0.2
+
+# The events that the board schedules again and again, in the order of those of one time.
+CLOCKS = ("report", "inputs", "battery", "reset")
 
 REST_AMPS, AMPS_PER_SPEED = 0.5, 0.05  # A at rest, and A for each rad/s of each wheel
 
 START_AMPS, START_NS = 10.0, 300 * MS  # while the motors start; it lowers the voltage by 2 V
 
-NEVER_NS = 2**62
-
 # From the arrival of a line to the start of the reply, in turn.
 PROCESSING_MS = (2.1, 1.3, 3.7, 1.0, 4.9, 2.6, 1.8, 3.2)
 
 
-class FakeMcu(Faults):
+class FakeMcu:
     """The simulated board: `receive()` takes the host's bytes, `advance()` returns its own.
 
     Call `advance()` at the times that `next_ns()` returns.
     """
 
     def __init__(self, config: Config, now_ns: Ns = 0) -> None:
-        super().__init__()
         self._vehicle = Vehicle(config.sim, config.drive)
-        self.baud_rate = config.mcu.baud_rate
+        self.switches = Switches(
+            config.mcu.baud_rate, bumpers="." * (len(config.safety.bumpers) or 4)
+        )
+        self._passed = {"reply": 0, "command": 0, "bit": 0}  # for faults of every n-th
         self._counts = config.sim.encoder_counts
         self._wiring = _wiring(config.mcu.wheels)
         self._now_ns = self._moved_ns = now_ns  # last event or `advance()`; time of the vehicle
@@ -79,18 +90,9 @@ class FakeMcu(Faults):
         self.valid_lines = 0
         self._watchdog_trips = 0
         self._checks = False  # the host has sent a valid checksum: status lines have one, too
-        self._bumpers = "." * (len(config.safety.bumpers) or 4)  # while none is pressed
-        # Begin, end, field of the status line, value. `silent` leaves the field out. The last fault
-        # of a field decides, except that each pressed bumper is reported.
-        self._inputs: tuple[tuple[int, int, str, str], ...] = ()
-        self._inputs_clock = b""
-        self._battery_clock = b""
-        self._charge = self._capacity = 1.0  # 0 to 1, and ampere seconds
-        # When the charge was computed, and when all set points were zero.
-        self._drained_ns = self._rested_ns = now_ns
         self._lasting = ExitStack()
         for text in config.sim.faults:
-            self._lasting.enter_context(self.switched_on(named(text)))
+            self._lasting.enter_context(self.fault(*parse(text)))
 
     @property
     def vehicle(self) -> Vehicle:
@@ -115,9 +117,9 @@ class FakeMcu(Faults):
             offset += len(piece) + 1
             line = (self._held + piece + b"\n")[-256:]
             self._held = b""
-            self._schedule(start + wire_ns(offset, self.baud_rate), "line", line)
+            self._schedule(start + wire_ns(offset, self.switches.baud_rate), "line", line)
         self._held = (self._held + rest)[-256:]
-        self._in_free_ns = start + wire_ns(len(data), self.baud_rate)
+        self._in_free_ns = start + wire_ns(len(data), self.switches.baud_rate)
 
     def next_ns(self) -> Ns | None:
         """Return when to call `advance()` next; None: not before `receive()`."""
@@ -133,26 +135,18 @@ class FakeMcu(Faults):
                 out += self._handed_over(due_ns, what, data)
             elif what == "line":
                 self.heard.append((due_ns, data))
-                lost = self._hit("command", self.lose_command)
+                lost = self._hit("command", self.switches.lose_command)
                 if due_ns >= self._boot_until_ns and not lost:
-                    delay = int(next(self._processing) * MS) + self.extra_delay_ns
+                    delay = int(next(self._processing) * MS) + self.switches.extra_delay_ns
                     self._schedule(due_ns + delay, "act", data)
             elif what == "act":
                 self._act(due_ns, data)
             elif what == "booted":
                 self._send_identity(due_ns)
-            elif what == "report" and data == self._clock:
-                if due_ns >= self._boot_until_ns:
-                    self._reply(due_ns, protocol.Command({}))
-                self._schedule(due_ns + self.unprompted_ns, "report", data)
             elif what == "status":
                 self._send_inputs(due_ns)
-            elif what == "inputs" and data == self._inputs_clock:
-                self._send_inputs(due_ns)
-                self._schedule(due_ns + STATUS_NS, "inputs", data)
-            elif what == "battery" and data == self._battery_clock:
-                self._send_battery(due_ns)
-                self._schedule(due_ns + STATUS_NS, "battery", data)
+            elif (clock := self.switches.clocks.get(what)) and clock.name == data:
+                self._tick(due_ns, what, clock)
         self._now_ns = now_ns
         return out
 
@@ -172,29 +166,41 @@ class FakeMcu(Faults):
         self._schedule(now_ns + deaf_ns // 2, "sent", b"\x00\xf8\xff~boot\r\n")
         self._schedule(now_ns + deaf_ns, "booted", b"")
         self._checks = False
-        if self._clock:
-            self._schedule(now_ns + self.unprompted_ns, "report", self._clock)
-        if self._inputs:
-            self._schedule(now_ns + STATUS_NS, "inputs", self._inputs_clock)
-        if self._battery_clock:
-            self._schedule(now_ns + STATUS_NS, "battery", self._battery_clock)
-        for begin_ns, end_ns, _, _ in self._inputs:
+        for what in CLOCKS:
+            if clock := self.switches.clocks.get(what):
+                self._schedule_tick(now_ns, what, clock)
+        for begin_ns, end_ns, _, _ in self.switches.inputs:
             self._schedule_changes(begin_ns, end_ns)
+
+    def _tick(self, now_ns: Ns, what: str, clock: Clock) -> None:
+        if what == "reset":
+            self.reset(now_ns)
+            return
+        if what == "report" and now_ns >= self._boot_until_ns:
+            self._reply(now_ns, protocol.Command({}))
+        elif what == "inputs":
+            self._send_inputs(now_ns)
+        elif what == "battery" and self.switches.battery:
+            self._send_battery(now_ns, self.switches.battery)
+        self._schedule_tick(now_ns, what, clock)
+
+    def _schedule_tick(self, now_ns: Ns, what: str, clock: Clock) -> None:
+        self._schedule(now_ns + clock.period_ns, what, clock.name)
 
     def _schedule(self, due_ns: Ns, what: str, data: bytes) -> None:
         heapq.heappush(self._events, (due_ns, next(self._order), what, data))
 
     def _catch_up(self) -> None:
         vehicle, now_ns, moved_ns = self._vehicle, self._now_ns, self._moved_ns
-        deadline = self._fed_ns + self.watchdog_ns
-        if deadline <= now_ns and self.watchdog and any(vehicle.set_points):
+        deadline = self._fed_ns + self.switches.watchdog_ns
+        if deadline <= now_ns and self.switches.watchdog and any(vehicle.set_points):
             deadline = max(deadline, moved_ns)
-            vehicle.advance((deadline - moved_ns) / NS_PER_S, self.push)
+            vehicle.advance((deadline - moved_ns) / NS_PER_S, self.switches.push)
             moved_ns = deadline
             self._watchdog_trips += 1
             vehicle.set_points[:] = [0.0] * 4
         if now_ns > moved_ns:
-            vehicle.advance((now_ns - moved_ns) / NS_PER_S, self.push)
+            vehicle.advance((now_ns - moved_ns) / NS_PER_S, self.switches.push)
             moved_ns = now_ns
         self._moved_ns = moved_ns
 
@@ -206,7 +212,7 @@ class FakeMcu(Faults):
             return
         command = self.understand(line)
         if command is None:
-            if self.any_feeds:
+            if self.switches.any_feeds:
                 self._catch_up()
                 self._fed_ns = now_ns
             return
@@ -214,57 +220,65 @@ class FakeMcu(Faults):
         # points.
         set_points = self.vehicle.set_points
         for output, value in command.values.items():
-            motor = self.drivers[output]
+            motor = self.switches.drivers[output]
             wheel, forward = self._wiring[motor]
-            set_points[wheel] = forward * self.drives[motor] * value
+            set_points[wheel] = forward * self.switches.drives[motor] * value
         self.valid_lines += 1
         self._fed_ns = now_ns
-        if not self.unprompted_ns:
+        if "report" not in self.switches.clocks:
             self._reply(now_ns, command)
 
+    def understand(self, line: bytes) -> protocol.Command | None:
+        """Decode a line of the host as the firmware does."""
+        return protocol.DECODERS[self.switches.firmware](line)
+
     def _send_identity(self, now_ns: Ns) -> None:
-        if self.understand is protocol.reference:
+        switches = self.switches
+        if switches.firmware == "reference":
             self._send(
-                now_ns, protocol.identity(self._counts, self.watchdog_ns // MS, self.samples)
+                now_ns,
+                protocol.identity(self._counts, switches.watchdog_ns // MS, switches.samples),
             )
 
     def _reply(self, now_ns: Ns, command: protocol.Command) -> None:
-        if self.muted or now_ns - self._replied_ns < self.reply_gap_ns:
+        switches = self.switches
+        if switches.muted or now_ns - self._replied_ns < switches.reply_gap_ns:
             return
         self._replied_ns = now_ns
-        comma, end = self.ending[:-2].encode(), self.ending[-2:].encode()
+        comma, end = switches.ending[:-2].encode(), switches.ending[-2:].encode()
         speeds = tuple(self._speeds(now_ns))
-        text = protocol.speeds_text(speeds, self.separator, self.unpadded_replies) + comma
+        text = protocol.speeds_text(speeds, switches.separator, switches.unpadded_replies) + comma
         if command.sequence:
             self._checks = True
-            sample = self._sample() if command.wants_sample and self.samples else ()
+            sample = self._sample() if command.wants_sample and switches.samples else ()
             text += protocol.suffix(text, command.sequence, sample)
-        if self._hit("reply", self.lose_reply):
+        if self._hit("reply", switches.lose_reply):
             return
-        data = self._damaged(self.noise_bytes + text + end)
-        self._send(now_ns, data[: len(data) // 2] if self.cut_replies else data)
+        data = self._damaged(switches.noise_bytes + text + end)
+        self._send(now_ns, data[: len(data) // 2] if switches.cut_replies else data)
 
     def _send(self, now_ns: Ns, data: bytes) -> None:
         begin_ns = max(self._out_free_ns, now_ns)
-        end_ns = begin_ns + wire_ns(len(data), self.baud_rate)
-        if begin_ns > now_ns and end_ns - now_ns > wire_ns(OUTPUT_BYTES, self.baud_rate):
+        end_ns = begin_ns + wire_ns(len(data), self.switches.baud_rate)
+        if begin_ns > now_ns and end_ns - now_ns > wire_ns(OUTPUT_BYTES, self.switches.baud_rate):
             return
         self._out_free_ns = end_ns
         self._schedule(self._out_free_ns, "sent", data)
 
     def _handed_over(self, now_ns: Ns, what: str, data: bytes) -> bytes:
         # "batch": the adapter's timer has expired; "sent": `data` has come from the board.
+        switches = self.switches
         until_ns = self._stalled_until(now_ns)
         if until_ns > now_ns:
             self._schedule(until_ns, what, data)
             return b""
         begun, waited = bool(self._batch), self._batch + data
         full = len(waited) // USB_PACKET * USB_PACKET
-        if what == "batch" or not self.latency_ns:
+        if what == "batch" or not switches.latency_ns:
             full = len(waited)
         self._batch = waited[full:]
         if self._batch and not begun:
-            tick_ns = -(-now_ns // self.latency_ns) * self.latency_ns
+            tick_ns = -(-now_ns // switches.latency_ns) * switches.latency_ns
             self._schedule(tick_ns, "batch", b"")
         return waited[:full]
 
@@ -278,26 +292,26 @@ class FakeMcu(Faults):
 
     def _speeds(self, now_ns: Ns) -> list[float]:
         since, before = self._window
-        gains = self.gains
-        if self.stuck is not None:
-            gains = [0.0 if motor == self.stuck else gain for motor, gain in enumerate(gains)]
+        switches, gains = self.switches, self.switches.gains
+        if switches.stuck is not None:
+            gains = (*gains[: switches.stuck], 0.0, *gains[switches.stuck + 1 :])
         if now_ns - since >= MIN_WINDOW_NS:
             counts = self._encoders()
-            if counts == before and self.frozen is None:
+            if counts == before and switches.frozen is None:
                 # No motor has turned by a count, so wrong gains and swapped wires have no effect.
                 self._moved, self._measured = [0] * 4, [0.0] * 4
                 self._window = (now_ns, counts)
                 return [0.0] * 4
             scale = math.tau / self._counts * NS_PER_S / (now_ns - since)
             every = [b - a for a, b in zip(before, counts, strict=True)]
-            signs = self.encoder_signs
-            moved = [every[encoder] * signs[encoder] for encoder in self.encoders]
-            if self.frozen is not None:
-                moved[self.frozen] = self._moved[self.frozen]
+            signs = switches.encoder_signs
+            moved = [every[encoder] * signs[encoder] for encoder in switches.encoders]
+            if switches.frozen is not None:
+                moved[switches.frozen] = self._moved[switches.frozen]
             self._moved = moved
             measured = [count * scale for count in moved]
-            if self.frozen is not None:
-                measured[self.frozen] = self._measured[self.frozen]
+            if switches.frozen is not None:
+                measured[switches.frozen] = self._measured[switches.frozen]
             self._measured = measured
             rows = zip(self._counted, moved, gains, strict=True)
             self._counted = [total + count * gain for total, count, gain in rows]
@@ -312,8 +326,8 @@ class FakeMcu(Faults):
 
     def _send_inputs(self, now_ns: Ns) -> None:
         fields: dict[str, str] = {}
-        for begin_ns, end_ns, name, value in self._inputs:
-            before = fields.setdefault(name, self._bumpers if name == "bumpers" else "ok")
+        for begin_ns, end_ns, name, value in self.switches.inputs:
+            before = fields.setdefault(name, self.switches.bumpers if name == "bumpers" else "ok")
             if begin_ns <= now_ns < end_ns:
                 both = name == "bumpers" and "silent" not in (value, before)
                 fields[name] = "".join(map(max, value, before)) if both else value
@@ -322,20 +336,21 @@ class FakeMcu(Faults):
             self._send_status(now_ns, fields)
 
     def _send_status(self, now_ns: Ns, fields: dict[str, str]) -> None:
-        if not self.muted and now_ns >= self._boot_until_ns:
+        if not self.switches.muted and now_ns >= self._boot_until_ns:
             self._send(now_ns, self._damaged(protocol.status(fields, self._checks)))
 
-    def _send_battery(self, now_ns: Ns) -> None:
-        seconds, self._drained_ns = (now_ns - self._drained_ns) / NS_PER_S, now_ns
+    def _send_battery(self, now_ns: Ns, battery: Battery) -> None:
+        seconds, battery.drained_ns = (now_ns - battery.drained_ns) / NS_PER_S, now_ns
         turning = sum(map(abs, self.vehicle.set_points))
         if not turning:
-            self._rested_ns = now_ns
+            battery.rested_ns = now_ns
         amps = REST_AMPS + AMPS_PER_SPEED * turning
-        if turning and now_ns - self._rested_ns <= START_NS:
+        if turning and now_ns - battery.rested_ns <= START_NS:
             amps += START_AMPS
-        self._charge = max(0.0, self._charge - amps * seconds / self._capacity)
-        volts = EMPTY_VOLTS + CHARGED_VOLTS * self._charge - RESISTANCE * amps
-        charge = f"{100 * self._charge:.0f}%"
+        capacity = REST_AMPS * 60 * battery.minutes
+        battery.charge = max(0.0, battery.charge - amps * seconds / capacity)
+        volts = EMPTY_VOLTS + CHARGED_VOLTS * battery.charge - RESISTANCE * amps
+        charge = f"{100 * battery.charge:.0f}%"
         fields = {"volts": f"{volts:.2f}", "amps": f"{-amps:.2f}", "charge": charge}
         self._send_status(now_ns, fields)
 
@@ -344,90 +359,50 @@ class FakeMcu(Faults):
             if self._now_ns <= change_ns < NEVER_NS:
                 self._schedule(change_ns, "status", b"")
 
-    # The following faults are not in `faults.py`, because they need the events of the board.
+    # Faults.
 
-    def estop(self) -> Fault:
-        """Make the board report a released emergency stop ten times per second."""
-        return self._input("estop", "ok")
-
-    def estop_pressed(self, after_s: float, length_s: float) -> Fault:
-        """Make the board report a press of the emergency stop; 0 s is a press without end.
-
-        It reports a released one before and after. The motors keep their power.
-        """
-        return self._input("estop", "pressed", after_s, length_s)
-
-    def estop_silent(self, after_s: float, length_s: float) -> Fault:
-        """Make the board report a released emergency stop, with a pause; 0 s is one without end."""
-        return self._input("estop", "silent", after_s, length_s)
-
-    def bumpers(self) -> Fault:
-        """Make the board report `safety.bumpers`, or four, all released."""
-        return self._input("bumpers", self._bumpers)
-
-    def bumper_pressed(self, number: float, after_s: float, length_s: float) -> Fault:
-        """Make the board report a press of a bumper, counted from 1; 0 s is a press without end.
-
-        It reports released ones before and after. The motors keep their power.
-        """
-        marks = ["X" if i == number else mark for i, mark in enumerate(self._bumpers, 1)]
-        return self._input("bumpers", "".join(marks), after_s, length_s)
-
-    def bumpers_silent(self, after_s: float, length_s: float) -> Fault:
-        """Make the board report released bumpers, with a pause; 0 s is one without end."""
-        return self._input("bumpers", "silent", after_s, length_s)
-
-    def driver_fault(self, after_s: float, length_s: float) -> Fault:
-        """Make the board report a fault of the motor driver; 0 s is one without end."""
-        return self._input("driver", "fault", after_s, length_s)
+    def fault(self, name: str, *arguments: object) -> AbstractContextManager[None]:
+        """Switch on a fault of the table for a `with` block."""
+        return self.switched(FAULTS[name].switch, *arguments)
 
     @contextmanager
-    def battery(self, percent: float, minutes: float) -> Iterator[None]:
-        """Make the board report a battery ten times per second. Its charge begins at `percent` %.
-
-        A full one lasts `minutes` at rest, and less while the robot drives.
-        """
-        clock = b"battery %d" % next(self._order)
-        self._schedule(self._now_ns + STATUS_NS, "battery", clock)
-        with self._with(
-            _battery_clock=clock,
-            _charge=percent / 100,
-            _capacity=REST_AMPS * 60 * minutes,
-            _drained_ns=self._now_ns,
-            _rested_ns=self._now_ns,
-        ):
+    def switched(self, change: Callable[..., Switches], *arguments: object) -> Iterator[None]:
+        """Change the switches for a `with` block, as the function of a row of the table does."""
+        before = self.switches
+        self._turn(change(replace(before, now_ns=self._now_ns), *arguments))
+        try:
             yield
+        finally:
+            self._turn(before)
 
-    @contextmanager
-    def _input(
-        self, field: str, value: str, after_s: float = 0.0, length_s: float = 0.0
-    ) -> Iterator[None]:
-        begin_ns = self._now_ns + int(after_s * NS_PER_S)
-        end_ns = begin_ns + int(length_s * NS_PER_S) if length_s else NEVER_NS
-        clock = self._inputs_clock
-        if not clock:
-            clock = b"inputs %d" % next(self._order)
-            self._schedule(self._now_ns + STATUS_NS, "inputs", clock)
-        self._schedule_changes(begin_ns, end_ns)
-        inputs = (*self._inputs, (begin_ns, end_ns, field, value))
-        with self._with(_inputs=inputs, _inputs_clock=clock):
-            yield
-        self._schedule(self._now_ns, "status", b"")
+    def _turn(self, switches: Switches) -> None:
+        # Until now the old switches were in force, so first simulate the vehicle with them.
+        self._catch_up()
+        before, self.switches = self.switches, switches
+        for what, clock in switches.clocks.items():
+            if clock is not before.clocks.get(what):
+                clock.name = b"%d" % next(self._order)
+                self._schedule_tick(self._now_ns, what, clock)
+        for begin_ns, end_ns, _, _ in switches.inputs[len(before.inputs) :]:
+            self._schedule_changes(begin_ns, end_ns)
+        if len(switches.inputs) < len(before.inputs):
+            self._schedule(self._now_ns, "status", b"")
 
-    @contextmanager
-    def free_running(self, period_s: float = 0.1) -> Iterator[None]:
-        """Make the board report every `period_s`, not in reply to each line.
+    def _hit(self, what: str, every: int) -> bool:
+        self._passed[what] += 1
+        return every > 0 and self._passed[what] % every == 0
 
-        The reports end with a comma, and their speeds are not padded (`3.14` instead of `03.14`).
-        """
-        period_ns = int(period_s * NS_PER_S)
-        # Each clock has a new name, so that the board ignores events of an older clock.
-        clock = b"clock %d" % next(self._order)
-        self._schedule(self._now_ns + period_ns, "report", clock)
-        with self._with(
-            unprompted_ns=period_ns, _clock=clock, unpadded_replies=True, ending=",\r\n"
-        ):
-            yield
+    def _damaged(self, data: bytes) -> bytes:
+        if not data or not self._hit("bit", self.switches.bit_error):
+            return data
+        place, bit = divmod(self._passed["bit"] * 59 % (8 * len(data)), 8)
+        return b"%b%c%b" % (data[:place], data[place] ^ 1 << bit, data[place + 1 :])
+
+    def _stalled_until(self, now_ns: Ns) -> Ns:
+        every_ns = self.switches.stall_every_ns
+        if not every_ns:
+            return now_ns
+        return max(now_ns, now_ns // every_ns * every_ns + self.switches.stall_ns)
 
 
 def _wiring(wheels: WheelMap) -> list[tuple[int, int]]:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import lru_cache
 
 from msgspec import Struct
@@ -74,6 +74,15 @@ def latched(line: bytes) -> Command:
             if math.isfinite(value):
                 values[MOTORS.encode().index(motor)] = value if sign == b"p" else -value
     return Command(values)
+
+
+# By firmware.
+DECODERS: dict[str, Callable[[bytes], Command | None]] = {
+    "reference": reference,
+    "plain_only": plain_only,
+    "prefix": prefix,
+    "latched": latched,
+}
 
 
 def _plain(text: bytes) -> Command | None:

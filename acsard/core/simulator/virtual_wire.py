@@ -36,7 +36,7 @@ class VirtualWire:
 
     def send(self, data: bytes) -> None:
         assert self.is_open, "the connection is closed"
-        self.mcu.receive(self._now_ns, garbled(data, self._baud_rate, self.mcu.baud_rate))
+        self.mcu.receive(self._now_ns, garbled(data, self._baud_rate, self.mcu.switches.baud_rate))
 
     def listen(self, until_ns: Ns) -> list[Piece]:
         """Advance the virtual time, and return pieces of bytes with the time of their arrival."""
@@ -45,7 +45,7 @@ class VirtualWire:
             due_ns = max(due_ns, self._now_ns)
             data = self.mcu.advance(due_ns)
             if data:
-                pieces.append((due_ns, garbled(data, self.mcu.baud_rate, self._baud_rate)))
+                pieces.append((due_ns, garbled(data, self.mcu.switches.baud_rate, self._baud_rate)))
         self._now_ns = max(self._now_ns, until_ns)
         self.mcu.advance(self._now_ns)
         return pieces

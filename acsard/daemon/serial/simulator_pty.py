@@ -81,7 +81,7 @@ class SimPty:
         self._end = PtyEnd()
         self.path = self._end.path
         # In case the host sets none.
-        set_baud_rate(self._end.slave, self.mcu.baud_rate)
+        set_baud_rate(self._end.slave, self.mcu.switches.baud_rate)
         loop = asyncio.get_running_loop()
         loop.add_reader(self._end.fileno(), self._read)
         loop.add_reader(self._timer.fileno(), self._advance)
@@ -101,19 +101,19 @@ class SimPty:
             data = data[-INPUT_BYTES:].partition(b"\n")[2]
         if data:
             now_ns = clock.now().mono_ns
-            self.mcu.receive(now_ns, garbled(data, self._speed(), self.mcu.baud_rate))
+            self.mcu.receive(now_ns, garbled(data, self._speed(), self.mcu.switches.baud_rate))
             self._arm()
 
     def _speed(self) -> int:
         # The board's, for a rate that acsard does not support.
         rate = baud_rate_of(self._end.slave)
-        return rate if rate in get_args(Baud) else self.mcu.baud_rate
+        return rate if rate in get_args(Baud) else self.mcu.switches.baud_rate
 
     def _advance(self) -> None:
         self._timer.expirations()
         data = self.mcu.advance(clock.now().mono_ns)
         if data:
-            self._end.write(garbled(data, self.mcu.baud_rate, self._speed()))
+            self._end.write(garbled(data, self.mcu.switches.baud_rate, self._speed()))
         self._arm()
 
     def _arm(self) -> None:
