@@ -38,7 +38,7 @@ Where to look: each package may import only the packages below it in this list.
     terminal/        prints tables and output of all tools with the library rich; asks the person
                      near the robot questions
     host/            the parts that every process uses: clock, timers, threads and the mailboxes
-                     between them, child processes, files, rate limits, systemd, logs, errors
+                     between them, child processes, files, systemd, logs, errors
     checkup/         `acsard mcu check`: one module for each check of the board
     core/            the robot as a pure function: no clock, no I/O, no thread
 
@@ -58,6 +58,7 @@ Inside `core/`, in the same order:
     core/config/     turns acsard.toml into one frozen Config, or into errors that name the key
                      and the remedy
     core/values.py   the values in SI units: Instant, Twist, Pose, Command, Heard, News
+    core/throttle.py  the limit of a rate: of log lines, requests, reports
     core/formatting.py  safe text, numbers, durations and counts for every message
 
 Three invariants hold, and each is tested:

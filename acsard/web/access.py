@@ -19,8 +19,8 @@ from msgspec.structs import replace
 
 from acsard.bus.zenoh_sessions import MAX_MESSAGE_BYTES
 from acsard.core.config.settings import WebConfig
+from acsard.core.throttle import Rate, Throttle
 from acsard.host import clock
-from acsard.host.rate_limits import Buckets, Rate
 from acsard.web.answers import STATUS_CODES, TroubleError, problem, secured
 from acsard.web.callers import (
     LOCAL_NAME,
@@ -80,7 +80,7 @@ class Access:
         self._origins = frozenset(rules.origins)
         self._robot, self._names, self._tokens = robot, names, tokens
         self._connections, self._counts = connections, connections.counts
-        self._rates = Buckets(REQUEST_RATE)
+        self._rates = Throttle()
         self._rows: dict[web.AbstractRoute, Route] = {}
 
     def application(self, rows: Iterable[Route], page: object) -> web.Application:
@@ -170,7 +170,7 @@ class Access:
                 f"{MAX_OF_TOKEN} connections with this token are open already: close some pages, "
                 "or ask for a token of your own",
             )
-        elif not self._rates.take(identity.token, clock.mono_ns()):
+        elif not self._rates.take(clock.mono_ns(), REQUEST_RATE, identity.token):
             self._connections.end(identity.token, FLOOD_TEXT, but=connection)
             refusal = RequestRefusedError("too_fast", f"requests with this token: {FLOOD_TEXT}")
         if refusal is not None:

@@ -12,13 +12,13 @@ import asyncio
 import socket
 import ssl
 import traceback
+from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Never, Protocol
 
 from aiohttp import StreamReader, web
 
-from acsard.host.rate_limits import Places
 from acsard.web.answers import HEADERS, cut, problem, unsent_bytes
 from acsard.web.callers import is_loopback, network_of, unmapped
 from acsard.web.metrics import Counts
@@ -49,6 +49,33 @@ class HasContext(Protocol):
     """The certificate of a listening socket, which may be replaced."""
 
     context: ssl.SSLContext
+
+
+class Places:
+    """Limits the number of simultaneous uses, such as connections, in total and for each name."""
+
+    def __init__(self, most: int, per_name: int) -> None:
+        self._most, self._per_name = most, per_name
+        self._counts: Counter[str] = Counter()
+
+    @property
+    def taken(self) -> int:
+        return self._counts.total()
+
+    def room(self, name: str) -> bool:
+        return self._counts[name] < self._per_name and self.taken < self._most
+
+    def enter(self, name: str) -> bool:
+        """Take a place; return False if none is free."""
+        if not self.room(name):
+            return False
+        self._counts[name] += 1
+        return True
+
+    def leave(self, name: str) -> None:
+        self._counts[name] -= 1
+        if not self._counts[name]:
+            del self._counts[name]
 
 
 class Connections:

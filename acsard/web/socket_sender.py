@@ -17,8 +17,8 @@ import msgspec
 from aiohttp import web
 
 from acsard.core.messages.keys_and_roles import BEAT
+from acsard.core.throttle import Rate, Throttle
 from acsard.host import clock
-from acsard.host.rate_limits import Buckets, Rate
 from acsard.web.answers import cut, unsent_bytes
 from acsard.web.callers import Reason
 from acsard.web.metrics import Counts
@@ -70,7 +70,7 @@ class Outgoing:
         # The queue is limited, because the client may have stopped reading.
         self._out: deque[tuple[bytes, aiohttp.WSMsgType]] = deque(maxlen=200)
         self._news, self._loop = asyncio.Event(), asyncio.get_running_loop()
-        self._reports = Buckets(REPORT_RATE)
+        self._reports = Throttle()
         self._closing = False
 
     def enqueue(self, message: object) -> None:
@@ -92,7 +92,7 @@ class Outgoing:
     def refuse(self, what: str, reason: Reason, text: str) -> None:
         """Count a refused message, and report it to the client within `REPORT_RATE`."""
         self._counts.refuse(reason, self._origin)
-        if self._reports.take(f"{what} {reason}", clock.mono_ns()):
+        if self._reports.take(clock.mono_ns(), REPORT_RATE, f"{what} {reason}"):
             self.enqueue(Refused(what, text))
 
     def subscribe(self, key: str, rate: float) -> None:

@@ -15,10 +15,10 @@ from acsard.client.ride import MAX_SOURCE_TIMEOUT_S
 from acsard.client.signing import CommandSigner
 from acsard.core.messages.permissions import COMMAND_ROLE, SERVICE_ROLES
 from acsard.core.messages.signature import public_name
+from acsard.core.throttle import Throttle
 from acsard.core.values import Role, Twist
 from acsard.host import clock
 from acsard.host.own_identity import sender_id
-from acsard.host.rate_limits import Bucket
 from acsard.web import socket_messages
 from acsard.web.access import FLOOD_TEXT, REQUEST_RATE
 from acsard.web.callers import AdmittedClient, RequestRefusedError
@@ -80,7 +80,7 @@ class Viewer:
         # Public name, in `state.sender` while the client drives; the sender id stays secret.
         self.sender = public_name(whole, parts.robot.certificate)
         self._socket = socket
-        self._bucket = Bucket(REQUEST_RATE)
+        self._rate = Throttle()
         self._out = Outgoing(socket, request, parts.robot.streams, parts.counts, who.origin)
         # A call, the stops and the end, each while it is under way.
         self._calling: asyncio.Task[None] | None = None
@@ -128,7 +128,7 @@ class Viewer:
         if message.type == aiohttp.WSMsgType.ERROR:  # aiohttp closes the connection after this
             self._counts.refuse("too_big", self.who.origin)
             return
-        room = self._bucket.take(clock.mono_ns())
+        room = self._rate.take(clock.mono_ns(), REQUEST_RATE)
         if message.type == aiohttp.WSMsgType.PING:
             self._out.pong(message.data)
         elif message.type == aiohttp.WSMsgType.TEXT:

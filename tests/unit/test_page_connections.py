@@ -14,7 +14,6 @@ from unittest.mock import Mock
 import pytest
 from aiohttp import web
 
-from acsard.host.rate_limits import Places
 from acsard.web import connections
 from acsard.web.access import REQUEST_RATE
 from acsard.web.connections import (
@@ -28,6 +27,7 @@ from acsard.web.connections import (
     UNREAD_S,
     Connections,
     HttpConnection,
+    Places,
 )
 from acsard.web.metrics import Counts
 

@@ -109,7 +109,7 @@ def test_no_field_of_a_state_contains_configuration() -> None:
     assert not [name for name in modules if name.startswith("acsard.core.config")]
 
 
-@each("value", [{"free_ns": {"stop": "soon"}}, 5, [{}, 0, {}]])
+@each("value", [{"rates": {"free_ns": {"stop": "soon"}}}, 5, [{}, 0, {}]])
 def test_a_field_with_a_value_of_another_type_is_refused(value: object) -> None:
     frozen = msgspec.msgpack.decode(driven())
     frozen["state"]["throttle"] = value

@@ -9,10 +9,11 @@ from __future__ import annotations
 from operator import itemgetter
 from typing import get_args
 
-from msgspec import Struct
+from msgspec import Struct, field
 from msgspec.structs import replace
 
-from acsard.core.values import NS_PER_S, Event, Level, Ns
+from acsard.core.throttle import Rate, Throttle
+from acsard.core.values import Event, Level, Ns
 
 BURST = 5  # lines of one name without a delay: enough for a person who presses buttons
 
@@ -59,7 +60,7 @@ class EventThrottle(Struct):
 
     held: dict[str, Held] = {}  # by name
     number: int = 0  # of events of all names
-    free_ns: dict[str, Ns] = {}  # next line of a name at one per second, after a burst
+    rates: Throttle = field(default_factory=Throttle)  # of the lines, by name
 
     def lines(self, events: list[Event], now_ns: Ns) -> tuple[Event, ...]:
         """Return the events to log now, which may stand for several of the same name."""
@@ -68,8 +69,13 @@ class EventThrottle(Struct):
         for event in events:
             self.number += 1
             self.held.setdefault(event.name, Held(event)).add(event, self.number)
+        # The burst is for news, and for each stop, whose time matters.
         due_names = [
-            name for name, group in self.held.items() if self._may(name, group.news, now_ns)
+            name
+            for name, group in self.held.items()
+            if self.rates.take(
+                now_ns, Rate(1.0, BURST if group.news or name == "stop" else 1), name
+            )
         ]
         if "stop" in due_names or "clear" in due_names:
             # A stop and a `clear` stay in order: the end of the log shows whether the robot stands.
@@ -78,14 +84,6 @@ class EventThrottle(Struct):
             ]
             due_names.sort(key=lambda name: self.held[name].number)
         return tuple([self.held.pop(name).line() for name in due_names])
-
-    def _may(self, name: str, news: bool, now_ns: Ns) -> bool:
-        # `BURST` is for news, and for each stop, whose time matters.
-        free_ns, at_once = self.free_ns.get(name, now_ns), news or name == "stop"
-        if free_ns > now_ns + (BURST - 1 if at_once else 0) * NS_PER_S:
-            return False
-        self.free_ns[name] = max(free_ns, now_ns) + NS_PER_S
-        return True
 
 
 def merge(before: Event, line: Event) -> Event:

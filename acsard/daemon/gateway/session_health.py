@@ -7,9 +7,9 @@ from collections.abc import Sequence
 
 from msgspec import Struct
 
+from acsard.core.throttle import Rate, Throttle
 from acsard.core.values import NS_PER_S, Event, Ns
 from acsard.host.child import Silence
-from acsard.host.rate_limits import Bucket, Rate
 
 STUCK_AFTER_NS = NS_PER_S  # an observation takes a millisecond
 
@@ -40,7 +40,7 @@ class SessionHealth:
         self._most = most
         self._linked_ns, self._patience_ns = opened_ns, FIRST_CONNECTION_NS
         self._last_ns, self._silence = 0, Silence(STUCK_AFTER_NS)
-        self._reports = Bucket(REPORT_RATE)
+        self._reports = Throttle()
         self.full = 0  # observations with all connections in use
 
     def full_event(self, observed: Observation) -> Event | None:
@@ -48,7 +48,7 @@ class SessionHealth:
         if len(observed.holders) < self._most:
             return None
         self.full += 1
-        if not self._reports.take(observed.at_ns):
+        if not self._reports.take(observed.at_ns, REPORT_RATE):
             return None
         text = (
             f"all {self._most} connections are in use, {connection_counts(observed.holders)}: no "
