@@ -29,8 +29,8 @@ from acsard.core.messages.schema import (
     TwistStamped,
     Vector3,
 )
-from acsard.core.ros.channels import BY_KEY, CHANNELS, CMD_VEL_IN, LOG_CHANNEL
-from acsard.core.ros.shapes import log, state
+from acsard.core.ros.channels import BY_KEY, CHANNELS, CMD_VEL_IN, LOG_CHANNEL, state
+from acsard.core.ros.shapes import log
 from acsard.recording.export import export
 from acsard.recording.file import Recording
 from acsard.recording.published import MEASURED_ROWS

@@ -2,21 +2,21 @@
 
 All are CDR with their `ros2msg` definitions (ROS 2 Jazzy and later), for Foxglove, Lichtblick and
 PlotJuggler; `ros2 bag play` refuses a file with another encoding. `state` has a type of the package
-`acsard` (`shapes.py`), which it skips and viewers show. Names and types come from `transports.py`.
+`acsard`, which it skips and viewers show. Names and types come from `transports.py`.
 """
 
 from __future__ import annotations
 
 from collections.abc import Container, Iterator
-from typing import Any
+from typing import Annotated, Any
 
-from msgspec import Struct
+from msgspec import Meta, Struct, convert, defstruct
 
 from acsard.core.messages.encodings import encode
 from acsard.core.messages.keys_and_roles import by_key
-from acsard.core.messages.schema import MESSAGES, Imu, RobotState, TwistStamped
+from acsard.core.messages.schema import MESSAGES, Header, Imu, RobotState, TwistStamped
 from acsard.core.ros.names import Qos, full_name
-from acsard.core.ros.shapes import Log, State, state
+from acsard.core.ros.shapes import Log
 from acsard.core.ros.transports import GYRO_TOPIC, PUBLISHED
 
 ACSARD_PREFIX = "acsard/msg/"  # of types that ROS does not have
@@ -144,6 +144,41 @@ def _short(kind: str) -> str:
     return kind.replace("/msg/", "/")
 
 
+# The types of the fields of the package `acsard`. CDR has no null, which is NaN (`cdr_types.py`).
+_TYPES: dict[str, Any] = {
+    "string": str,
+    "int64": Annotated[int, Meta(extra={"cdr": "q"})],
+    "float64": float | None,
+    "float64[]": list[float],
+    "bool[]": list[bool],
+    "std_msgs/msg/Header": Header,
+}
+
+
+def _struct(name: str) -> type[Struct]:
+    fields = [
+        (field, _TYPES[kind] if kind in _TYPES else list[_struct(kind.removesuffix("[]"))])  # type: ignore[misc]
+        for kind, field in DEFINITIONS[name]
+    ]
+    return defstruct(name.rpartition("/")[2], fields, frozen=True)
+
+
+STATE_TYPE = ACSARD_PREFIX + "RobotState"
+
+State = _struct(STATE_TYPE)
+
+
+def state(message: RobotState) -> Struct:
+    """Convert a `RobotState` to the type of ROS. CDR has no maps, so the counters are a list."""
+    same = {name: getattr(message, name, None) for name in State.__struct_fields__}
+    other = {
+        "header": Header(message.stamp),
+        "bumpers": message.bumpers or [],
+        "counters": [{"name": name, "count": count} for name, count in message.counters.items()],
+    }
+    return convert(same | other, State, from_attributes=True)
+
+
 ENCODING, SCHEMA_ENCODING = "cdr", "ros2msg"  # in MCAP and in Foxglove's protocol
 
 SOURCE_PLACEHOLDER = "<source>"
@@ -155,7 +190,7 @@ class Channel(Struct, frozen=True):
     name: str  # relative to the namespace
     native: str  # native key, without `acsard/<robot.id>/`
     schema_name: str  # `pkg/msg/Name`
-    message: type[Struct]  # as CDR encodes it; for `state`, that of `shapes.py`
+    message: type[Struct]  # as CDR encodes it
     qos: Qos = Qos()
 
     def topic(self, namespace: str, source: str = "") -> str:
@@ -168,7 +203,7 @@ class Channel(Struct, frozen=True):
         return schema_text(self.schema_name)
 
     def encode(self, message: Any) -> bytes:
-        """Encode a message as CDR; a `RobotState` becomes `State` of `shapes.py`."""
+        """Encode a message as CDR; a `RobotState` becomes `State`."""
         return encode(state(message) if isinstance(message, RobotState) else message, "cdr")
 
 
@@ -183,7 +218,7 @@ def _published() -> dict[str, Channel]:
     return channels
 
 
-STATE_CHANNEL = Channel("state", "state", ACSARD_PREFIX + "RobotState", State)
+STATE_CHANNEL = Channel("state", "state", STATE_TYPE, State)
 
 # Each event is one log message.
 LOG_CHANNEL = Channel("log", "events", "rcl_interfaces/msg/Log", Log, Qos(1000))
