@@ -45,6 +45,7 @@ Where to look: each package may import only the packages below it in this list.
 Inside `core/`, in the same order:
 
     core/simulator/  the vehicle, the simulated microcontroller and its faults
+    core/summary.py  what `state` and `diagnostics` say about a robot
     core/robot.py    hear, drive and sent; core/guard.py checks each outgoing line
     core/robot_state.py  all that the robot knows between two steps; a recording stores it as it is
     core/reasons.py  the text in `reason`

@@ -25,10 +25,10 @@ from acsard.core.config.settings import DIAGNOSTICS_HZ, BusConfig, Config, RosCo
 from acsard.core.messages.diagnostics import diagnostics
 from acsard.core.motion.neutral import NEUTRAL_PAUSE_NS
 from acsard.core.ros.transports import ros_names
-from acsard.core.values import NS_PER_S, GyroStatus, Recording
+from acsard.core.values import NS_PER_S, Recording
 from tests import promised
 from tests.each import each
-from tests.unit.examples import OUTPUTS, SNAPSHOT
+from tests.unit.examples import OUTPUTS, SNAPSHOT, changed
 
 FILES = Path(__file__).parents[1] / "deploy" / "ros2"
 CONFIG = Config()
@@ -359,9 +359,9 @@ def groups() -> dict[str, dict[str, Any]]:
 def row_names() -> list[str]:
     """Return the name of every row that acsard can publish on `diagnostics`."""
     config = replace(CONFIG, bus=BusConfig(connect=("tcp/a:7447",)))
-    snapshot = replace(
+    snapshot = changed(
         SNAPSHOT,
-        gyro=GyroStatus("used"),
+        gyro="used",
         recording=Recording("/somewhere"),
         latch_file="",
         board={"emergency_stop": "released"},

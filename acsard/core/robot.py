@@ -18,7 +18,6 @@ from acsard.core.codes import Reason, RefusalCode, reason
 from acsard.core.config.live import Changes, changed, describe_changes
 from acsard.core.config.parsing import ConfigError
 from acsard.core.config.settings import Config, LimitsConfig
-from acsard.core.link.board_status import as_text
 from acsard.core.link.feedback import Line
 from acsard.core.link.link_setup import LinkSetup
 from acsard.core.link.link_state import WATCHDOG_S
@@ -52,7 +51,6 @@ from acsard.core.values import (
     Pose,
     Refusal,
     Request,
-    Snapshot,
     SpeedCap,
     Status,
     Trip,
@@ -114,47 +112,6 @@ class Robot:
         # Until then, a step decides nothing if it brings only lines; 0: not even now.
         self._calm_until_ns: Ns = 0
         self._nothing = Heard(True)  # what `hear` gets if nothing arrives
-
-    def snapshot(self, now_ns: Ns) -> Snapshot:
-        """Return what `state` and `diagnostics` need; too slow for every wake-up."""
-        state = self.state
-        session, silent = state.session, state.session.silent(now_ns)
-        refused, since_ns = state.refused or ("", None)
-        counters = {"lines": session.good_lines} | state.odometry.counters()
-        counters |= {f"line_{reason}": count for reason, count in session.rejects.items() if count}
-        if session.coarse_lines:
-            counters["coarse_encoder_lines"] = session.coarse_lines
-        checks = state.checks
-        life = state.life
-        ages = {number: (now_ns - at_ns) / NS_PER_S for number, at_ns in life.shown.items()}
-        return Snapshot(
-            status=state.status,
-            causes=life.latches.causes,
-            cause_ages=ages,
-            applied=self.applied,
-            pose=state.odometry.pose,
-            measured=None if silent else state.odometry.twist,
-            speeds=None if silent else state.odometry.speeds,
-            sources=state.arbiter.status(now_ns, self.config.commands),
-            counters=counters | state.counters,
-            refused=refused,
-            refused_age_s=None if since_ns is None else (now_ns - since_ns) / NS_PER_S,
-            feedback_age_s=session.feedback_age_s(now_ns),
-            gyro=checks.gyro_status(self.config.odometry),
-            doubt=checks.wheels_status(self.config.feedback),
-            check=session.check(self.link_setup),
-            unanswered=state.unanswered.told,
-            encoders=session.encoder_counts(self.link_setup),
-            pose_doubt=session.doubt.code,
-            port_released=life.port_released,
-            sender=state.choice.sender,
-            estop=state.inputs.estop.state,
-            bumpers=state.inputs.bumpers.pressed,
-            bumper=state.inputs.bumpers.why(self.config.safety),
-            battery=state.inputs.battery.status,
-            board=self._board(now_ns),
-            speed_limit=self._cap_text,
-        )
 
     def waits(self, now_ns: Ns) -> dict[str, Reason]:
         """Return what each source that sends, but does not drive, waits for."""
@@ -440,14 +397,6 @@ class Robot:
         elif away != twist:
             state.choice = replace(state.choice, twist=away)
 
-    def _board(self, now_ns: Ns) -> dict[str, str]:
-        state = self.state
-        status_ns = state.session.status.last_ns
-        if status_ns is None:
-            return {}
-        age_s = (now_ns - status_ns) / NS_PER_S
-        return as_text(state.session.status.last) | {"age_s": f"{age_s:.1f}"}
-
     def _is_plausible(self, line: Line, now: Instant, events: list[Event]) -> bool:
         state = self.state
         why = state.sanity.impossible(line, self.config.feedback.wheel_speed)
@@ -655,13 +604,6 @@ class Robot:
             return
         text = "the speed limit has ended" if cap.speed is None else f"{cap.speed:.3g} m/s"
         events.append(Event("speed_limit", text, by=cap.by, news=False))
-
-    @property
-    def _cap_text(self) -> str:
-        cap, highest = self.state.cap, self.config.limits.linear_speed
-        if cap.speed is None or cap.speed >= highest:
-            return ""
-        return f"{cap.speed:.3g} m/s, set by {cap.by}; back to {highest:g} m/s when this limit ends"
 
     # Report.
 

@@ -14,8 +14,6 @@ from acsard.core.codes import (
     Code,
     GuardCode,
     ObjectionCode,
-    PoseCode,
-    Reason,
     RefusalCode,
     WaitCode,
 )
@@ -464,64 +462,9 @@ class News(Struct, frozen=True):
     status_changed: bool = False
 
 
-class Spread(Struct, frozen=True):
-    """Statistics of `count` measurements, in their unit."""
-
-    count: int = 0
-    p50: float = 0.0
-    p99: float = 0.0
-    max: float = 0.0
-
-
-class Measured(Struct, frozen=True):
-    """Statistics of one latency of the daemon, us."""
-
-    since_start: Spread = Spread()
-    last_minute: Spread = Spread()
-
-
 class Recording(Struct, frozen=True):
     """The state of the recorder."""
 
     where: str = ""  # directory, or "" if recording is off
     trouble: str = ""  # why recording fails at present
     missing: int = 0  # steps
-
-
-class Snapshot(Struct, frozen=True):
-    """The values for the messages that are not of a feedback line."""
-
-    status: Status
-    causes: tuple[Cause, ...]  # in force, the newest last
-    cause_ages: dict[int, Seconds]  # since each was published, by its number
-    applied: Twist  # commanded, after all limits
-    pose: Pose
-    measured: Twist | None  # None while the feedback is silent
-    speeds: WheelSpeeds | None  # None while the feedback is silent
-    sources: tuple[SourceStatus, ...]
-    counters: dict[str, int]
-    refused: str  # last refused command, and why
-    refused_age_s: float | None = None  # since then, without new senders
-    feedback_age_s: float | None = None  # since the last valid line of the board
-    missed_last_minute: int = 0  # control periods without a step
-    figures: dict[str, Measured] = {}  # `daemon/latencies.py`
-    gyro: GyroStatus = GyroStatus()
-    doubt: WheelsStatus = WheelsStatus()
-    pose_doubt: PoseCode | Literal[""] = ""
-    port_released: bool = False  # to another program
-    estop: EstopState = ""
-    bumpers: tuple[bool, ...] | None = None  # pressed, in the board's order; None if never reported
-    bumper: Reason | None = None  # why one counts as pressed
-    battery: BatteryStatus | None = None  # None if never reported
-    board: dict[str, str] = {}  # last values of its status lines, and their age in `age_s`, s
-    check: str = "plain"  # form of the serial lines, such as "plain"
-    # Counts per turn, by `WHEELS`; 0 if not configured, or contradicted by the speeds.
-    encoders: tuple[int, ...] = ()
-    unanswered: bool = False  # more than 2 % of the lines
-    sender: str = ""  # selected by the arbiter
-    routers: RoutersStatus = RoutersStatus()
-    recording: Recording = Recording()
-    # Why the latches would not survive a restart; None without a file.
-    latch_file: str | None = None
-    settings_differ: str = ""  # settings that `set` changed since the start
-    speed_limit: str = ""  # one that lowers a setting

@@ -16,7 +16,8 @@ from itertools import accumulate, cycle
 from operator import add
 from typing import Final, Literal, get_args
 
-from acsard.core.values import NS_PER_S, Measured, Ns, Spread
+from acsard.core.messages.schema import Latency, Spread
+from acsard.core.values import NS_PER_S, Ns
 
 PER_DECADE = 20  # buckets: a percentile is at most 12 % too high
 
@@ -97,14 +98,14 @@ class Figure:
         self._slots = [Histogram() for _ in range(SLOTS)]
         self._number = -SLOTS
 
-    def measured(self, now_ns: Ns) -> Measured:
+    def measured(self, now_ns: Ns) -> Latency:
         self.sort(now_ns)
         minute = Histogram()
         for slot in self._slots:
             minute.merge(slot)
         last_minute = minute.spread()
         minute.merge(self._past)
-        return Measured(minute.spread(), last_minute)
+        return Latency(minute.spread(), last_minute)
 
     def sort(self, now_ns: Ns) -> None:
         """Count the raw durations in the slot of this time."""
@@ -138,14 +139,14 @@ class Stopwatch:
     def __init__(self) -> None:
         self.figures: dict[Name, Figure] = {name: Figure() for name in NAMES}
         self._missed = LastMinuteCount()
-        self._cached: dict[str, Measured] = {}
+        self._cached: dict[str, Latency] = {}
         self._cached_ns = -FRESH_NS
         # Of a duration, ns: for latencies that a wake-up measures itself.
         self.step_time = self.figures["step_time"].add
         self.round_trip = self.figures["mcu_round_trip"].add
         self._turns, self._turn_ns = cycle(self.figures.values()), 0
 
-    def measured(self, now_ns: Ns) -> dict[str, Measured]:
+    def measured(self, now_ns: Ns) -> dict[str, Latency]:
         """Return the statistics of each latency, us, at most 1 s old."""
         if now_ns - self._cached_ns >= FRESH_NS:
             self._cached_ns = now_ns

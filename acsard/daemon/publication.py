@@ -19,7 +19,9 @@ from acsard.core.messages.encodings import DecodeError
 from acsard.core.messages.keys_and_roles import BEAT
 from acsard.core.messages.report import Report
 from acsard.core.messages.schema import Beat, Info, Message
+from acsard.core.messages.snapshot import Snapshot
 from acsard.core.robot import Robot
+from acsard.core.summary import summary
 from acsard.core.values import (
     NS_PER_US,
     Answer,
@@ -30,7 +32,6 @@ from acsard.core.values import (
     Recording,
     Refusal,
     Request,
-    Snapshot,
     Twist,
 )
 from acsard.daemon.intake import Intake
@@ -153,21 +154,28 @@ class Publication:
         return Beat(self._run, self._boot_ns() // NS_PER_US)
 
     def counters(self) -> dict[str, int]:
-        return self._snapshot().counters
+        return self._snapshot().state.counters
 
     def _snapshot(self) -> Snapshot:
         now_ns = self.now.mono_ns
-        shot, intake, recorder = self._robot.snapshot(now_ns), self.intake, self._recorder
+        shot, intake, latch_file = summary(self._robot, now_ns), self.intake, self._keeper.trouble
+        recording = Recording() if self._recorder is None else self._recorder.status
         named = [one.describe(key) for key, one in self._differing.items()]
+        state = replace(
+            shot.state,
+            counters=shot.state.counters | intake.counters,
+            latencies=self.stopwatch.measured(now_ns),
+            recording_error=recording.trouble,
+            latch_file_error=latch_file or "",
+            settings_differ=listed(named, MAX_NAMED),
+        )
         return replace(
             shot,
-            counters=shot.counters | intake.counters,
-            figures=self.stopwatch.measured(now_ns),
+            state=state,
             missed_last_minute=self.stopwatch.missed(now_ns),
             routers=intake.routers.status,
-            latch_file=self._keeper.trouble,
-            recording=Recording() if recorder is None else recorder.status,
-            settings_differ=listed(named, MAX_NAMED),
+            recording=recording,
+            latch_file=latch_file,
         )
 
     def _use(self, config: Config, answers: tuple[Answer, ...]) -> None:

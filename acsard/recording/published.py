@@ -26,6 +26,7 @@ from acsard.core.robot import Robot
 from acsard.core.ros.channels import BY_KEY, CMD_VEL_IN, IMU_CHANNEL, LOG_CHANNEL, Channel
 from acsard.core.ros.shapes import LEVELS, Log, command_message
 from acsard.core.ros.transports import left_out
+from acsard.core.summary import summary
 from acsard.core.values import Command, GyroSample, Instant, News, WallNs
 from acsard.recording.file import Recording
 from acsard.recording.recorded_steps import RecordedStep
@@ -108,7 +109,7 @@ class Publisher:
             yield self._gyro(sample, now)
         applied = robot.applied if step.driven else None
         for key, message in self._report.due(
-            now, news, applied, self._keys, lambda: robot.snapshot(now.mono_ns)
+            now, news, applied, self._keys, lambda: summary(robot, now.mono_ns)
         ):
             yield Published(BY_KEY[key], "", now.wall_ns, _without_measurements(message))
 

@@ -8,18 +8,24 @@ from typing import Any
 from msgspec.structs import replace
 
 from acsard.core.messages.report import Report
-from acsard.core.messages.schema import Message
+from acsard.core.messages.schema import (
+    BatterySummary,
+    Latency,
+    Message,
+    RobotState,
+    SourceState,
+    Spread,
+    Time,
+)
+from acsard.core.messages.snapshot import Snapshot
 from acsard.core.values import (
     BatteryStatus,
     Estimate,
     Event,
     Instant,
-    Measured,
     Pose,
     PoseCovariance,
-    Snapshot,
     SourceStatus,
-    Spread,
     Status,
     Twist,
     TwistVariances,
@@ -61,24 +67,45 @@ OUTPUTS = Outputs(
 STATUS = Status("driving", "commanded", "commanded by app", "up", "app")
 
 SNAPSHOT = Snapshot(
-    status=STATUS,
-    causes=(),
-    cause_ages={},
+    RobotState(
+        stamp=Time(),
+        mode=STATUS.mode,
+        reason=STATUS.reason,
+        code=STATUS.code,
+        x=1.6,
+        y=-2.6,
+        yaw=0.6,
+        linear=0.26,
+        angular=-0.76,
+        wheels=[1.1, 2.1, 3.1, 4.1],
+        link=STATUS.link,
+        source=STATUS.source,
+        sources=[
+            SourceState("app", 50, 0.01, "", "nothing"),
+            SourceState("nav", 10, None, "a command", "command"),
+        ],
+        refused="source nav: held up",
+        counters={"lines": 100, "line_malformed": 2, "commands": 7, "command_stale": 3},
+        latencies={
+            "period_lateness": Latency(
+                Spread(1000, 50.0, 400.0, 900.0), Spread(100, 40.0, 80.0, 90.0)
+            )
+        },
+        battery=BatterySummary(22.5, 40.0, -1.5, "ok"),
+    ),
     applied=Twist(0.3, 0.9),
-    pose=Pose(1.6, -2.6, 0.6),
-    measured=Twist(0.26, -0.76),
-    speeds=WheelSpeeds(1.1, 2.1, 3.1, 4.1),
     sources=(
         SourceStatus("app", 50, 0.01, Wait("nothing")),
         SourceStatus("nav", 10, None, Wait("command")),
     ),
-    counters={"lines": 100, "line_malformed": 2, "commands": 7, "command_stale": 3},
-    refused="source nav: held up",
     battery=BatteryStatus("ok", 103_900_000_000, 22.5, 40.0, -1.5, 21.75),
-    figures={
-        "period_lateness": Measured(Spread(1000, 50.0, 400.0, 900.0), Spread(100, 40.0, 80.0, 90.0))
-    },
 )
+
+
+def changed(snapshot: Snapshot, **changes: Any) -> Snapshot:
+    """Return a snapshot with other values, of its own fields or else of those of `state`."""
+    own = {name: changes.pop(name) for name in snapshot.__struct_fields__ if name in changes}
+    return replace(snapshot, state=replace(snapshot.state, **changes), **own)
 
 
 def due(
@@ -96,9 +123,15 @@ def due(
 
 
 def with_outputs(snapshot: Snapshot, outputs: Outputs) -> Snapshot:
-    status = Status(outputs.mode, outputs.code, outputs.reason, outputs.link, outputs.source)
-    causes = outputs.latches.causes
-    return replace(snapshot, status=status, causes=causes, applied=outputs.applied)
+    return changed(
+        snapshot,
+        mode=outputs.mode,
+        code=outputs.code,
+        reason=outputs.reason,
+        link=outputs.link,
+        source=outputs.source,
+        applied=outputs.applied,
+    )
 
 
 def at(instant: Instant, **changes: Any) -> Outputs:

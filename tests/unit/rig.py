@@ -8,7 +8,9 @@ from msgspec.structs import replace
 
 from acsard.core.config.settings import Config, FeedbackConfig
 from acsard.core.link.codec import Codec
+from acsard.core.messages.snapshot import Snapshot
 from acsard.core.robot import Robot
+from acsard.core.summary import summary
 from acsard.core.values import (
     NS_PER_S,
     REST,
@@ -21,7 +23,6 @@ from acsard.core.values import (
     Pose,
     Received,
     Request,
-    Snapshot,
     Twist,
     Verb,
     WheelSpeeds,
@@ -162,11 +163,11 @@ class Rig:
 
     @property
     def snapshot(self) -> Snapshot:
-        return self.robot.snapshot(self.now_ns)
+        return summary(self.robot, self.now_ns)
 
     @property
     def counters(self) -> dict[str, int]:
-        return self.snapshot.counters
+        return self.snapshot.state.counters
 
 
 def names(outputs: Outputs) -> list[str]:

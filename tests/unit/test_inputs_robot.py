@@ -53,7 +53,7 @@ def test_status_lines_are_no_replies_and_damaged_ones_change_nothing() -> None:
     rig.step()
     assert rig.counters["line_status_without_crc"] == 1
     rig.board(b"!status estop=ok*9C94\r\n").step()
-    assert rig.snapshot.estop == "released"
+    assert rig.snapshot.state.emergency_stop == "released"
 
 
 # bumpers
@@ -144,7 +144,8 @@ def test_a_board_without_inputs_does_not_inherit_those_of_the_previous_one(
     assert {out.mode for out in rig.each(290, GO)} == {mode}
     assert not rig.answer("clear").success
     rig.run(20, GO)
-    assert (rig.snapshot.estop, rig.snapshot.bumpers, rig.snapshot.board) == ("", None, {})
+    state = rig.snapshot.state
+    assert (state.emergency_stop, state.bumpers, rig.snapshot.board) == ("", None, {})
     while rig.out.latches.causes:
         assert rig.answer("clear").success
     assert rig.drives()

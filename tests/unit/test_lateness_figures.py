@@ -8,7 +8,8 @@ from itertools import pairwise
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from acsard.core.values import NS_PER_S, Measured, Spread
+from acsard.core.messages.schema import Latency, Spread
+from acsard.core.values import NS_PER_S
 from acsard.daemon.latencies import (
     DECADES,
     PER_DECADE,
@@ -59,7 +60,7 @@ def test_count_and_maximum_are_exact_and_the_percentiles_in_order(durations_ns: 
 MINUTE_NS = SLOT_NS * SLOTS
 
 
-def step_time(stopwatch: Stopwatch, now_ns: int) -> Measured:
+def step_time(stopwatch: Stopwatch, now_ns: int) -> Latency:
     return stopwatch.measured(now_ns)["step_time"]
 
 

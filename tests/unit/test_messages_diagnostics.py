@@ -25,24 +25,19 @@ from acsard.core.config.settings import (
     SafetyConfig,
 )
 from acsard.core.messages.diagnostics import SHOW_REFUSAL_S, diagnostics
-from acsard.core.messages.schema import DiagnosticStatus
+from acsard.core.messages.schema import DiagnosticStatus, Latency, Spread
 from acsard.core.motion.bumpers import SILENT_REASON
 from acsard.core.motion.modes import Mode
 from acsard.core.values import (
     BatteryLevel,
     BatteryStatus,
     GyroDoes,
-    GyroStatus,
-    Measured,
     RoutersStatus,
-    Snapshot,
     SourceStatus,
-    Spread,
     Wait,
-    WheelsStatus,
 )
 from tests.each import each
-from tests.unit.examples import OUTPUTS, SNAPSHOT
+from tests.unit.examples import OUTPUTS, SNAPSHOT, changed
 
 PAGE = Path(__file__).parent / "words" / "diagnostics.txt"
 LEVELS = ("ok", "WARNING", "ERROR")
@@ -79,12 +74,13 @@ SITUATIONS: dict[str, tuple[Config, dict[str, Any]]] = {
     "links that the board lost": (CONFIG, {"counters": BUSY | {"link_lost": 3}}),
     "a link lost once a day": (CONFIG, {"counters": DAYS_40 | {"link_lost": 40}}),
     "a link lost more than once a day": (CONFIG, {"counters": DAYS_40 | {"link_lost": 41}}),
-    "estimated encoder counts": (CONFIG, {"encoders": (20, 0, 0, 400)}),
+    "estimated encoder counts": (CONFIG, {"encoder_counts": [20, 0, 0, 400]}),
     "1 % missed periods": (CONFIG, {"missed_last_minute": 1}),
     "2 % missed periods": (CONFIG, {"missed_last_minute": 2}),
     "missed periods an hour ago": (CONFIG, {"counters": {"missed_periods": 100_000}}),
     "a bad minute after good hours": (
-        CONFIG, {"figures": {"period_lateness": Measured(Spread(10_000_000), Spread(5_800))},
+        CONFIG, {"latencies": {"period_lateness": Latency(Spread(10_000_000, 0, 0, 0),
+                                                          Spread(5_800, 0, 0, 0))},
                  "missed_last_minute": 200},
     ),
     "no source": (CONFIG, {"source": ""}),
@@ -95,25 +91,26 @@ SITUATIONS: dict[str, tuple[Config, dict[str, Any]]] = {
     "a refused source": (CONFIG, {"refused_age_s": SHOW_REFUSAL_S / 2}),
     "a source refused long ago": (CONFIG, {"refused_age_s": SHOW_REFUSAL_S}),
     "a left out and a slipping wheel": (
-        CONFIG, {"doubt": WheelsStatus("rear_left is left out", ("rear_left",), ("right",))},
+        CONFIG, {"wheel_fault": "rear_left is left out", "left_out": ("rear_left",),
+                 "slipping": ("right",)},
     ),
     "no encoders": (
         replace(CONFIG, feedback=FeedbackConfig(encoders=False)),
-        {"doubt": WheelsStatus(text="no encoders")},
+        {"wheel_fault": "no encoders"},
     ),
     **{f"an emergency stop that is {estop}": (
-        CONFIG, {"estop": estop, "board": {"volts": "24.31"},
+        CONFIG, {"emergency_stop": estop, "board": {"volts": "24.31"},
                  "counters": {"line_status_malformed": 2, "emergency_stops": 1, "lines": 9}},
     ) for estop in ("released", "pressed", "silent")},
     "a required emergency stop": (replace(CONFIG, safety=SafetyConfig(estop="required")), {}),
     "a motor driver in fault": (CONFIG, {"board": {"motor_driver": "fault"}}),
     "bumpers that are not reported": (BUMPERS, {}),
-    "bumpers": (BUMPERS, {"bumpers": (False, False)}),
+    "bumpers": (BUMPERS, {"bumpers": [False, False]}),
     "a pressed bumper": (
-        BUMPERS, {"bumpers": (True, False), "counters": {"bumper_presses": 1},
+        BUMPERS, {"bumpers": [True, False], "counters": {"bumper_presses": 1},
                   "bumper": reason("bumper", bumpers="front bumper pressed")},
     ),
-    "silent bumpers": (BUMPERS, {"bumpers": (True, True), "bumper": SILENT_REASON}),
+    "silent bumpers": (BUMPERS, {"bumpers": [True, True], "bumper": SILENT_REASON}),
     "bumpers that are ignored": (
         replace(CONFIG, safety=SafetyConfig(bumpers=("front", "rear"), bumper="off")), {},
     ),
@@ -128,17 +125,14 @@ SITUATIONS: dict[str, tuple[Config, dict[str, Any]]] = {
     ),
     "a connected router": (CONFIG, {"routers": RoutersStatus(("a",))}),
     "a router that is a peer": (CONFIG, {"routers": RoutersStatus(("a", "b"), peers=("b",))}),
-    **{f"a gyro: {does}": (CONFIG, {"gyro": GyroStatus(does)}) for does in get_args(GyroDoes)},
+    **{f"a gyro: {does}": (CONFIG, {"gyro": does}) for does in get_args(GyroDoes)},
     "a full disk": (CONFIG, {"latch_file": "No space left"}),
     "changed settings": (CONFIG, {"settings_differ": "rates.odom = 5"}),
 }  # fmt: skip
 
 
 def statuses(config: Config = CONFIG, **changes: Any) -> list[DiagnosticStatus]:
-    of_status = {key: changes.pop(key) for key in ("mode", "code", "link", "source", "reason")
-                 if key in changes}  # fmt: skip
-    shot: Snapshot = replace(SNAPSHOT, status=replace(SNAPSHOT.status, **of_status), **changes)
-    return diagnostics(config, OUTPUTS.now, shot, ("", "")).status
+    return diagnostics(config, OUTPUTS.now, changed(SNAPSHOT, **changes), ("", "")).status
 
 
 def words(status: DiagnosticStatus) -> list[str]:
@@ -165,7 +159,7 @@ def test_no_row_appears_or_disappears_in_any_state_of_the_robot(mode: str, link:
     names = [status.name for status in statuses()]
     assert len(set(names)) == len(names)
     found = statuses(
-        mode=mode, link=link, source="", figures={}, counters={}, sources=(), refused_age_s=0.0
+        mode=mode, link=link, source="", latencies={}, counters={}, sources=(), refused_age_s=0.0
     )
     assert [status.name for status in found] == names
     assert {status.hardware_id for status in found} == {"r7"}

@@ -19,6 +19,7 @@ from acsard.core.config.settings import Config
 from acsard.core.guard import Memory
 from acsard.core.robot import Robot
 from acsard.core.robot_state import State
+from acsard.core.summary import summary
 from acsard.recording.file import Recording
 from acsard.recording.replay import Playback
 from acsard.recording.state import (
@@ -59,7 +60,7 @@ def test_a_robot_is_read_back_unchanged(config: Config) -> None:
     restored = thaw(data)
     assert restored.memory == memory
     assert restored.robot.state == robot.state
-    assert restored.robot.snapshot(world.now_ns) == robot.snapshot(world.now_ns)
+    assert summary(restored.robot, world.now_ns) == summary(robot, world.now_ns)
     assert freeze(*restored) == freeze(*thaw(data, config)) == data
     errors = [column for column in robot.state.odometry.uncertainty.columns if any(column)]
     assert len(errors) >= 3 or config == PLAIN
@@ -142,4 +143,4 @@ def test_a_robot_of_another_layout_is_replaced_by_a_fresh_one_where_it_rests(
     assert re.match(r"\d\.\d s cannot be replayed: acsard .* in another layout, and a fresh", note)
     recorded, replayed = playback.comparison.end or ((0, 0, 0), (1, 1, 1))
     assert recorded == pytest.approx(replayed, abs=1000)
-    assert playback.robot.snapshot(world.now_ns).pose.x > 0.8
+    assert playback.robot.state.odometry.pose.x > 0.8

@@ -221,10 +221,10 @@ def test_a_speed_limit_applies_until_it_ends_and_each_change_is_an_event() -> No
     assert cap(0.3) == []
     path = rig.path(110, GO)  # an event that comes again within a second is held back
     assert min(path) == path[-1] == pytest.approx(0.3)
-    assert "0.3 m/s" in rig.snapshot.speed_limit
+    assert "0.3 m/s" in rig.snapshot.state.speed_limit
     assert cap(None) == ["joe"]
     assert rig.run(60, GO).applied == GO
-    assert rig.snapshot.speed_limit == ""
+    assert rig.snapshot.state.speed_limit == ""
 
 
 def test_more_than_one_implausible_line_in_a_hundred_is_an_event() -> None:

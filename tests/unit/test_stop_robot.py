@@ -85,7 +85,7 @@ def test_the_gyro_of_a_robot_that_another_program_may_turn_does_not_rest() -> No
     rig.unplug()
     for _ in range(100):
         rig.step(gyro=0.1)
-    assert rig.robot.snapshot(rig.now_ns).gyro.bias is None
+    assert rig.snapshot.gyro_bias is None
 
 
 @each(("speed", "released"), [(b"01.10", False), (b"00.90", True)])
@@ -124,7 +124,7 @@ def test_missed_periods_are_counted_and_reported() -> None:
 def test_the_samples_of_a_gyro_reach_its_check() -> None:
     rig = Rig(Config(odometry=OdometryConfig(gyro=True))).linked()
     rig.run(500, gyro=0.01)
-    assert rig.snapshot.gyro.bias == pytest.approx(0.01)
+    assert rig.snapshot.gyro_bias == pytest.approx(0.01)
 
 
 def test_several_requests_of_one_step_are_answered_in_order() -> None:

@@ -9,16 +9,25 @@ report, or from the start if they are required, until a board without them.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from typing import cast
 
 from msgspec import Struct
 
-from acsard.core.codes import GUARD_CODES, HOST_CODES, sentence
+from acsard.core.codes import GUARD_CODES, HOST_CODES, PoseCode, sentence
 from acsard.core.config.settings import Config
 from acsard.core.config.wire_time import wire_use
 from acsard.core.formatting import many
 from acsard.core.link.link_diagnosis import BUSY_ADVICE, MAX_UNANSWERED_FRACTION
 from acsard.core.messages.certificate_expiry import CERTIFICATE_LEVELS
-from acsard.core.messages.schema import DiagnosticArray, DiagnosticStatus, Header, KeyValue, Time
+from acsard.core.messages.schema import (
+    DiagnosticArray,
+    DiagnosticStatus,
+    Header,
+    KeyValue,
+    RobotState,
+    Time,
+)
+from acsard.core.messages.snapshot import Snapshot
 from acsard.core.motion import battery
 from acsard.core.motion.arbiter_text import waiting
 from acsard.core.motion.bumpers import missing_reason
@@ -33,11 +42,8 @@ from acsard.core.values import (
     WHEELS,
     GyroDoes,
     Instant,
-    Measured,
     Recording,
     RoutersStatus,
-    Snapshot,
-    Status,
 )
 
 OK, WARN, ERROR = 0, 1, 2
@@ -117,7 +123,7 @@ def diagnostics(
     `certificate` is the result of `expiry`, or two "" for no such row.
     """
     rows = [
-        _mode(snapshot.status),
+        _mode(snapshot.state),
         _serial_link(config, snapshot),
         _control_loop(snapshot),
         _commands(snapshot),
@@ -129,7 +135,7 @@ def diagnostics(
         *_recording(snapshot.recording),
         *_latch_file(snapshot.latch_file),
         *_certificate(*certificate),
-        _settings(snapshot.settings_differ),
+        _settings(snapshot.state.settings_differ),
     ]
     return DiagnosticArray(
         Header(Time.from_ns(now.wall_ns)),
@@ -153,7 +159,7 @@ def _row(name: str, findings: Sequence[Finding], values: dict[str, str]) -> Row:
     return Row(name, level, "; ".join(text for _, text, _ in findings), values, "; ".join(advice))
 
 
-def _mode(status: Status) -> Row:
+def _mode(status: RobotState) -> Row:
     advice = ""
     if status.mode == "stopped":
         advice = f"remove the cause, {CLEAR}"
@@ -171,26 +177,26 @@ def _check(config: Config) -> str:
 
 
 def _serial_link(config: Config, snapshot: Snapshot) -> Row:
-    mcu = config.mcu
+    mcu, state = config.mcu, snapshot.state
     use = wire_use(config.rate_hz, mcu.baud_rate, mcu.line_bytes)
-    named = zip(WHEELS, snapshot.encoders, strict=False)
+    named = zip(WHEELS, state.encoder_counts, strict=False)
     values = {"port": mcu.port, "wire_use": f"{use:.2f}", "check": snapshot.check}
-    if _is_reason(snapshot.status):
-        values["code"] = snapshot.status.code
-    if snapshot.feedback_age_s is not None:
-        values["feedback_age_s"] = f"{snapshot.feedback_age_s:.2f}"
+    if _is_reason(state):
+        values["code"] = state.code
+    if state.feedback_age is not None:
+        values["feedback_age_s"] = f"{state.feedback_age:.2f}"
     values |= {f"counts_{name}": str(counts) for name, counts in named if counts}
-    values |= _counted(snapshot.counters, "line") | _counted(snapshot.counters, "link")
+    values |= _counted(state.counters, "line") | _counted(state.counters, "link")
     return _row("serial link", [*_link(config, snapshot)], values)
 
 
-def _is_reason(status: Status) -> bool:
+def _is_reason(status: RobotState) -> bool:
     # The robot waits because of the link.
     return status.mode == "waiting" and status.link != "up"
 
 
 def _link(config: Config, snapshot: Snapshot) -> Iterator[Finding]:
-    status, counters, simulated = snapshot.status, snapshot.counters, config.mcu.simulated
+    status, counters, simulated = snapshot.state, snapshot.state.counters, config.mcu.simulated
     by_host = simulated or status.code in HOST_CODES
     advice = BUSY_ADVICE if by_host else _check(config)
     if status.link == "down" and not simulated:
@@ -202,8 +208,8 @@ def _link(config: Config, snapshot: Snapshot) -> Iterator[Finding]:
         reason = status.reason.removesuffix(" `acsard mcu check` finds out more").rstrip(";")
         why = f": {reason}" if _is_reason(status) else ""
         yield ERROR, f"{status.link}{why}", advice
-    if snapshot.pose_doubt:
-        yield WARN, sentence(snapshot.pose_doubt).text, ""
+    if status.pose_doubt:
+        yield WARN, sentence(cast("PoseCode", status.pose_doubt)).text, ""
     if simulated:
         yield WARN, "this is the simulator, no real wheel turns", SIMULATOR_ADVICE
     if snapshot.unanswered:
@@ -224,8 +230,10 @@ def _link(config: Config, snapshot: Snapshot) -> Iterator[Finding]:
 
 
 def _control_loop(snapshot: Snapshot) -> Row:
-    figures, missed = snapshot.figures, snapshot.missed_last_minute
-    run_count = figures.get("period_lateness", Measured()).last_minute.count
+    figures, counters = snapshot.state.latencies, snapshot.state.counters
+    missed = snapshot.missed_last_minute
+    lateness = figures.get("period_lateness")
+    run_count = lateness.last_minute.count if lateness else 0
     values = {
         f"{name}{when}_{share}_us": f"{getattr(spread, share):.0f}"
         for name, figure in figures.items()
@@ -237,18 +245,18 @@ def _control_loop(snapshot: Snapshot) -> Row:
         "control loop",
         level,
         f"{missed} of {run_count + missed} periods missed in the last minute",
-        values | _counted(snapshot.counters, "missed") | _counted(snapshot.counters, "bus"),
+        values | _counted(counters, "missed") | _counted(counters, "bus"),
         BUSY_ADVICE if level else "",
     )
 
 
 def _commands(snapshot: Snapshot) -> Row:
     values = {s.name: waiting(s.waits_for).text or "driving" for s in snapshot.sources}
-    values |= _counted(snapshot.counters, "command")
-    driver = snapshot.status.source
+    values |= _counted(snapshot.state.counters, "command")
+    driver = snapshot.state.source
     findings = [(OK, f"commanded by {driver}" if driver else "waiting for a command", "")]
-    if snapshot.speed_limit:
-        findings.append((OK, f"speed limit: {snapshot.speed_limit}", ""))
+    if snapshot.state.speed_limit:
+        findings.append((OK, f"speed limit: {snapshot.state.speed_limit}", ""))
     for source in snapshot.sources:
         if source.waits_for.what == "senders":
             text = (
@@ -259,45 +267,45 @@ def _commands(snapshot: Snapshot) -> Row:
             findings.append((WARN, text, advice))
     age_s = snapshot.refused_age_s
     if age_s is not None and age_s < SHOW_REFUSAL_S:
-        findings.append((WARN, f"refused: {snapshot.refused}", ""))
+        findings.append((WARN, f"refused: {snapshot.state.refused}", ""))
     return _row("commands", findings, values)
 
 
 def _wheels(config: Config, snapshot: Snapshot) -> Row:
-    doubt, counters = snapshot.doubt, snapshot.counters
+    text, counters = snapshot.state.wheel_fault, snapshot.state.counters
     advice = _check(config)
     if not config.feedback.encoders:
         advice = "if the robot has encoders, set feedback.encoders = true"
     values = {
-        "left_out": ", ".join(doubt.left_out),
-        "slipping": ", ".join(doubt.slipping),
+        "left_out": ", ".join(snapshot.left_out),
+        "slipping": ", ".join(snapshot.slipping),
     }
     values |= _counted(counters, "wheel_fault") | _counted(counters, "uncommanded_motion")
-    if not doubt.text:
+    if not text:
         return Row("wheels", OK, "every wheel obeys its command", values)
-    return Row("wheels", WARN, doubt.text, values, advice)
+    return Row("wheels", WARN, text, values, advice)
 
 
 def _board(config: Config, snapshot: Snapshot) -> list[Row]:
-    safety, bumpers = config.safety, snapshot.bumpers
+    safety, state = config.safety, snapshot.state
     required = safety.estop == "required"
     if not (snapshot.board or required or safety.needs_bumpers):
         return []
-    findings = [BOARD[snapshot.estop]]
-    if required and not snapshot.estop:
+    findings = [BOARD[state.emergency_stop]]
+    if required and not state.emergency_stop:
         findings = [(ERROR, MISSING_REASON.text, _check(config))]
     if snapshot.bumper is not None:
         level = ERROR if snapshot.bumper.code == "bumpers_silent" else WARN
         findings.append((level, snapshot.bumper.text, snapshot.bumper.advice))
-    elif bumpers is not None:
-        findings.append((OK, f"{many(len(bumpers), 'bumper')} released", ""))
+    elif state.bumpers is not None:
+        findings.append((OK, f"{many(len(state.bumpers), 'bumper')} released", ""))
     elif safety.needs_bumpers:
         findings.append((ERROR, missing_reason(safety).text, _check(config)))
     if snapshot.board.get("motor_driver") == "fault":
         findings.append((ERROR, DRIVER_FAULT_REASON.text, DRIVER_FAULT_REASON.advice))
     counted: dict[str, str] = {}
     for kind in ("line_status", "emergency", "bumper"):
-        counted |= _counted(snapshot.counters, kind)
+        counted |= _counted(snapshot.state.counters, kind)
     return [_row("board", findings, snapshot.board | counted)]
 
 
@@ -326,13 +334,13 @@ def _battery(config: Config, snapshot: Snapshot) -> list[Row]:
 
 
 def _gyro(snapshot: Snapshot) -> list[Row]:
-    gyro = snapshot.gyro
-    if gyro.does == "off":
+    does, bias = cast("GyroDoes", snapshot.state.gyro), snapshot.gyro_bias
+    if does == "off":
         return []
-    values = {} if gyro.bias is None else {"bias_rad_s": f"{gyro.bias:.5f}"}
-    values |= _counted(snapshot.counters, "imu_")
-    advice = GYRO_ADVICE.get(gyro.does, "")
-    return [Row("gyro", WARN if advice else OK, STATUS_TEXTS[gyro.does], values, advice)]
+    values = {} if bias is None else {"bias_rad_s": f"{bias:.5f}"}
+    values |= _counted(snapshot.state.counters, "imu_")
+    advice = GYRO_ADVICE.get(does, "")
+    return [Row("gyro", WARN if advice else OK, STATUS_TEXTS[does], values, advice)]
 
 
 def _routers(endpoints: Sequence[str], routers: RoutersStatus) -> list[Row]:

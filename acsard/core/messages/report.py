@@ -8,6 +8,8 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Collection, Mapping
 
+from msgspec.structs import replace
+
 from acsard.core.config.settings import DIAGNOSTICS_HZ, STATE_HZ, Config
 from acsard.core.messages.certificate_expiry import DAY_NS, expiry, first_expiry
 from acsard.core.messages.diagnostics import diagnostics
@@ -21,20 +23,15 @@ from acsard.core.messages.keys_and_roles import BEAT, BEAT_HZ
 from acsard.core.messages.recent_events import RecentEvents
 from acsard.core.messages.schema import (
     Battery,
-    BatterySummary,
-    Cause,
     DiagnosticArray,
     Header,
     JointState,
-    Latency,
     Message,
     Odometry,
     Pose,
     PoseWithCovariance,
     Quaternion,
     RobotState,
-    SourceState,
-    Spread,
     TFMessage,
     Time,
     Transform,
@@ -44,22 +41,18 @@ from acsard.core.messages.schema import (
     TwistWithCovariance,
     Vector3,
 )
-from acsard.core.motion.arbiter_text import waiting
+from acsard.core.messages.snapshot import Snapshot
 from acsard.core.values import (
     NS_PER_S,
     REST,
-    BatteryStatus,
     Estimate,
     Instant,
     News,
     Ns,
     PoseCovariance,
     Rad,
-    Snapshot,
     TwistVariances,
 )
-from acsard.core.values import Cause as LatchedCause
-from acsard.core.values import Spread as Measurements
 from acsard.core.values import Twist as BodyTwist
 
 GetSnapshot = Callable[[], Snapshot]
@@ -248,14 +241,12 @@ class Report:
             case "tf_static":
                 return self.tf_static()
             case "odom":
-                return (
-                    self._odom(estimate, get_snapshot().measured is not None) if estimate else None
-                )
+                return self._odom(estimate, bool(get_snapshot().state.wheels)) if estimate else None
             case "tf":
                 return self._tf(estimate) if estimate and self._config.odometry.publish_tf else None
             case "wheel_states":
                 return (
-                    self._wheel_states(estimate, get_snapshot().speeds is not None)
+                    self._wheel_states(estimate, bool(get_snapshot().state.wheels))
                     if estimate
                     else None
                 )
@@ -309,48 +300,11 @@ class Report:
 
     def _state(self, now: Instant, snapshot: Snapshot) -> RobotState:
         certificate, expiry_text = self._certificate(now)
-        status = snapshot.status
-        return RobotState(
+        return replace(
+            snapshot.state,
             stamp=Time.from_ns(now.wall_ns),
-            mode=status.mode,
-            reason=status.reason,
-            code=status.code,
-            x=snapshot.pose.x,
-            y=snapshot.pose.y,
-            yaw=snapshot.pose.yaw,
-            linear=snapshot.measured.linear if snapshot.measured else None,
-            angular=snapshot.measured.angular if snapshot.measured else None,
-            wheels=list(snapshot.speeds.as_tuple()) if snapshot.speeds else [],
-            link=status.link,
-            source=status.source,
-            sources=[
-                SourceState(
-                    s.name, s.priority, s.age_s, waiting(s.waits_for).text, s.waits_for.what
-                )
-                for s in snapshot.sources
-            ],
-            refused=snapshot.refused,
             certificate=certificate,
             certificate_expiry=expiry_text,
-            counters=snapshot.counters,
-            latencies={
-                name: Latency(_spread(figure.since_start), _spread(figure.last_minute))
-                for name, figure in snapshot.figures.items()
-            },
-            gyro=snapshot.gyro.does,
-            encoder_counts=list(snapshot.encoders),
-            wheel_fault=snapshot.doubt.text,
-            pose_doubt=snapshot.pose_doubt,
-            sender=snapshot.sender,
-            recording_error=snapshot.recording.trouble,
-            causes=[_cause(cause, snapshot.cause_ages) for cause in snapshot.causes],
-            latch_file_error=snapshot.latch_file or "",
-            feedback_age=snapshot.feedback_age_s,
-            emergency_stop=snapshot.estop,
-            bumpers=None if snapshot.bumpers is None else list(snapshot.bumpers),
-            battery=_summary(snapshot.battery),
-            settings_differ=snapshot.settings_differ,
-            speed_limit=snapshot.speed_limit,
             certificate_days=self._certificate_days(now),
             version=self._version,
         )
@@ -386,22 +340,6 @@ class Report:
 
     def _diagnostics(self, now: Instant, snapshot: Snapshot) -> DiagnosticArray:
         return diagnostics(self._config, now, snapshot, self._certificate(now))
-
-
-def _summary(battery: BatteryStatus | None) -> BatterySummary | None:
-    if battery is None:
-        return None
-    return BatterySummary(battery.volts, battery.percent, battery.amps, battery.level)
-
-
-def _cause(cause: LatchedCause, ages: dict[int, float]) -> Cause:
-    at = Time.from_ns(cause.at_ns)
-    age = ages.get(cause.number)
-    return Cause(cause.number, cause.kind, cause.code, cause.text, cause.by, at, cause.kept, age)
-
-
-def _spread(spread: Measurements) -> Spread:
-    return Spread(spread.count, spread.p50, spread.p99, spread.max)
 
 
 def _twist(twist: BodyTwist) -> Twist:
