@@ -20,7 +20,7 @@ from acsard.recording.recorded_steps import FinishedStep
 from tests.unit.drives import drive
 
 TAKEN = drive().taken
-SECOND = 200  # steps in a record of these tests
+SECOND = 150  # steps in a record of these tests
 
 
 def head(number: int, at: Instant) -> Head:
