@@ -9,12 +9,13 @@ import pytest
 from hypothesis import given, settings
 
 from acsard.core.config.settings import OdometryConfig
+from acsard.core.motion.gyro import Turn
 from acsard.core.motion.uncertainty import UNKNOWN_POSE
 from acsard.core.values import Pose, PoseCovariance
 from tests.each import each
 from tests.unit.nees import PERIOD, RADIUS, TRACK
 from tests.unit.odometer import Odometer
-from tests.unit.test_pose import counts, feedback, line, moves
+from tests.unit.test_pose import Says, counts, feedback, line, moves
 
 law = settings(max_examples=100)
 START = PoseCovariance(1e-6, 0.0, 0.0, 1e-6, 0.0, 1e-6)
@@ -106,6 +107,58 @@ def test_coarse_encoder_counts_make_the_pose_less_certain() -> None:
     count = 0.05 * math.tau / 20
     assert covariance.xx == pytest.approx(1e-6 + 2 * count**2 / 12 / 4)
     assert covariance.yawyaw == pytest.approx(1e-6 + 2 * count**2 / 12 / 0.3**2)
+
+
+def yaw_variance(robot: Odometer) -> float:
+    return robot.odometry.uncertainty.covariance.yawyaw
+
+
+def metre(robot: Odometer) -> Matrix:
+    """Return the growth of the covariance in 1 m to the front."""
+    before = matrix(robot.fold(line(0.0)).covariance)
+    for _ in range(200):
+        robot.fold(line(10.0))
+    return matrix(robot.fold(line(0.0, 0.05)).covariance) - before
+
+
+def test_a_long_way_makes_no_later_motion_less_certain() -> None:
+    # Rounding adds nothing after 45 km and 100 000 rad, in 12 h at rest, and far from the origin.
+    near, far = Odometer(), Odometer()
+    near.set_pose(Pose())
+    far.set_pose(Pose(45e3, 45e3))
+    assert metre(far) == pytest.approx(metre(near), rel=1e-6, abs=1e-15)
+    robot = Odometer(EXACT)
+    for left, right in [(100.0, 100.0)] * 4500 + [(-300.0, 300.0)] * 500:
+        robot.fold(feedback(left, right, 2.0))
+    assert robot.odometry.travelled == pytest.approx(45_000)
+    robot.model = near.model
+    before = robot.fold(line(0.0)).covariance
+    assert before.yawyaw == pytest.approx(1e-6)
+    for _ in range(12 * 60):
+        assert robot.fold(line(0.0, 60.0)).covariance == before
+    for turn in [0.3, -0.3] * 2000:
+        trembling = robot.fold(feedback(-turn, turn, 0.01)).covariance
+    assert trembling.yawyaw - before.yawyaw < 3e-5
+    assert metre(robot)[2, 2] == pytest.approx(1e-4)
+
+
+def test_each_line_adds_the_variance_of_the_source_of_its_turn() -> None:
+    robot = Odometer()
+
+    def drive(lines: int, variance: float | None) -> None:
+        robot.use(Says(always=None if variance is None else Turn(0.0, variance, 0.0, 1e-6)))
+        for _ in range(lines):
+            robot.fold(line(10.0))
+
+    drive(21, 1e-2)
+    before = yaw_variance(robot)
+    assert before == pytest.approx(0.21 + 1e-6)
+    # Each change of the source ends a stretch. 5 mm by the wheels add 5e-7.
+    for _ in range(100):
+        drive(2, None)
+        drive(3, 1e-7)
+    drive(1, None)
+    assert yaw_variance(robot) - before == pytest.approx(201 * 5e-7 + 300 * 1e-7)
 
 
 Moves = list[tuple[float, float, float]]
