@@ -21,7 +21,7 @@ from acsard.core.motion.consistency import ConsistencyChecks
 from acsard.core.motion.gaps import AT_REST, LONG_S, Rolled, Skipped, plus, rolled_over, times
 from acsard.core.motion.gyro import REST_S
 from acsard.core.motion.kinematics import on_arc
-from acsard.core.motion.uncertainty import MISSED_STD, UPDATE_S, ErrorModel, Uncertainty
+from acsard.core.motion.uncertainty import MISSED_STD, UPDATE_S, ErrorModel, Path, Uncertainty
 from acsard.core.values import (
     REST,
     STILL,
@@ -40,6 +40,7 @@ class Odometry(Struct):
 
     uncertainty: Uncertainty
     pose: Pose = Pose()  # of base_link in odom, yaw within [-pi, pi]
+    path: Path = Path()  # of base_link
     twist: Twist = REST  # in the last line
     speeds: WheelSpeeds = STILL  # in the last line
     positions: Motors = AT_REST  # of the wheels, rad
@@ -56,7 +57,7 @@ class Odometry(Struct):
 
     @classmethod
     def initial(cls, model: ErrorModel) -> Odometry:
-        return cls(Uncertainty.initial(model))
+        return cls(Uncertainty.initial(model, Pose()))
 
     def counters(self) -> dict[str, int]:
         """Return the counters `gaps`, `gap_ms` and `gaps_filled_ms` that are not 0."""
@@ -67,7 +68,7 @@ class Odometry(Struct):
         """Set the pose of base_link in odom, with the uncertainty of an initial pose."""
         self.positions, self.held = plus(self.positions, self.held), AT_REST
         self.pose = Pose(pose.x, pose.y, math.remainder(pose.yaw, math.tau))
-        self.uncertainty = Uncertainty.initial(model)
+        self.path, self.uncertainty = Path(), Uncertainty.initial(model, self.pose)
         self.was_set = True
 
     def fold(self, line: Line, checks: ConsistencyChecks, model: ErrorModel) -> Estimate:
@@ -76,7 +77,7 @@ class Odometry(Struct):
         A gyro's turn replaces that of the wheels, which then give the distance, and the other wheel
         of its side replaces a faulty one.
         """
-        speeds, wheels, pose, gap = line.speeds, checks.wheels, self.pose, None
+        speeds, wheels, gap = line.speeds, checks.wheels, None
         reported, seconds = speeds.as_tuple(), line.dt
         if line.bridged or line.gap or self.skipped.lines or seconds > LONG_S:
             gap, self.skipped = rolled_over(self.skipped, line, self.speeds.as_tuple()), Skipped()
@@ -106,25 +107,30 @@ class Odometry(Struct):
         self.travelled += abs(distance)
         before, self.twist, self.speeds = self.twist, Twist(linear, angular), speeds
 
-        uncertainty, state = self.uncertainty, (at_rest, slips, turn is not None)
+        pose, path, uncertainty = self.pose, self.path, self.uncertainty
+        state = at_rest, slips, turn is not None
         rested, due = self.state[0] and at_rest, state != self.state
         if due:
-            uncertainty.update(model, pose.yaw, slips=self.state[1], by_gyro=self.state[2])
+            uncertainty.update(model, pose, path, slips=self.state[1], by_gyro=self.state[2])
             self.state = state
         share = 0.5 if self.was_set else 1.0
-        dx, dy, yaw = on_arc(pose.yaw, share * distance, share * angle)
+        way, turned = share * distance, share * angle
+        dx, dy, yaw = on_arc(pose.yaw, way, turned)
         self.pose = Pose(pose.x + dx, pose.y + dy, yaw)
-        uncertainty.stretch.add(share * distance, share * angle, dx, dy, variance, seconds)
+        self.path = Path(
+            path.way + way, path.turned + turned, path.gyro_variance + variance, path.lines + 1
+        )
+        uncertainty.seconds += seconds
         doubts = wheels.possible_motion(rolled)
         due |= line.doubt is not None or (turn is not None and turn.doubt != 0.0)
-        if due or gap or doubts or self.was_set or uncertainty.stretch.seconds >= UPDATE_S:
-            uncertainty.update(model, yaw, slips=slips, by_gyro=turn is not None)
+        if due or gap or doubts or self.was_set or uncertainty.seconds >= UPDATE_S:
+            uncertainty.update(model, self.pose, self.path, slips=slips, by_gyro=turn is not None)
             rate_variance = None if turn is None else turn.rate_variance
             if at_rest:
                 uncertainty.set_rest(model, self.rested, slips, rate_variance)
             else:
                 uncertainty.set_twist(model, self.twist, slips, rate_variance)
-            heading = yaw - share * angle / 2
+            heading = yaw - turned / 2
             if self.was_set:
                 self.was_set = False
                 uncertainty.doubt((distance / 2) ** 2, (angle / 2) ** 2, 0.0, heading)

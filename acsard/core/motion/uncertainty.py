@@ -27,6 +27,7 @@ from acsard.core.motion.kinematics import Kinematics
 from acsard.core.motion.wheels import count_angle
 from acsard.core.values import (
     Metres,
+    Pose,
     PoseCovariance,
     Rad,
     Seconds,
@@ -35,7 +36,8 @@ from acsard.core.values import (
 )
 
 UPDATE_S = 0.05  # between two updates; lines that need one at once get it
-BEND_M = 0.2  # rolled, between two updates of the second order
+# Rolled, between two updates of the second order. The last term keeps rounding from deciding.
+BEND_M = 0.2 + 1e-9
 
 START_VARIANCE = 1e-6  # of x, y (m2) and yaw (rad2) at the start and after the pose was set
 MAX_VARIANCE = 1e9  # m2 or rad2, and of the twist: "unknown"
@@ -153,37 +155,22 @@ class ErrorModel:
         return along**2 + self.of_speed[0] * quantum, yaw**2 + self.of_speed[1] * quantum
 
 
-class Stretch(Struct):
-    """The motion since the last update."""
+class Path(Struct, frozen=True, gc=False):
+    """The motion of base_link since its pose was set; a stretch is the difference of two."""
 
-    distance: Metres = 0.0
-    turn: Rad = 0.0
-    dx: Metres = 0.0
-    dy: Metres = 0.0
-    gyro_variance: float = 0.0  # of the turn, rad2
-    seconds: Seconds = 0.0
+    way: Metres = 0.0  # forwards minus backwards
+    turned: Rad = 0.0  # to the left, not wrapped
+    gyro_variance: float = 0.0  # of `turned`, rad2
     lines: int = 0
-
-    def add(
-        self, distance: Metres, turn: Rad, dx: Metres, dy: Metres, variance: float, seconds: Seconds
-    ) -> None:
-        self.distance += distance
-        self.turn += turn
-        self.dx += dx
-        self.dy += dy
-        self.gyro_variance += variance
-        self.seconds += seconds
-        self.lines += 1
 
 
 class Bend(Struct):
-    """Second order: since its last update, and the sums."""
+    """Second order: the state at its last update, and the sums."""
 
     p: PoseCovariance
     columns: list[Vector]
-    dx: Metres = 0.0
-    dy: Metres = 0.0
-    rolled: Metres = 0.0
+    pose: Pose
+    rolled: Metres = 0.0  # since then
     # xx, xy and yy of the errors [e, n] / 2, which are independent in each stretch.
     noise: Vector = (0.0, 0.0, 0.0)
     # x and y of the sums of [J_i, W_k] / 2, m, for all causes i and parameters k.
@@ -200,39 +187,45 @@ class Uncertainty(Struct):
     covariance: PoseCovariance
     bend: Bend
     columns: list[Vector]  # of J
-    stretch: Stretch = field(default_factory=Stretch)
+    pose: Pose  # at the last update
+    path: Path = Path()  # then
+    # Since then; a sum, because the difference of two long times may be just below `UPDATE_S`.
+    seconds: Seconds = 0.0
     twist: TwistVariances = TwistVariances(
         MIN_TWIST_VARIANCE, MIN_TWIST_VARIANCE, MIN_TWIST_VARIANCE
     )
     period: Seconds = ASSUMED_PERIOD_S
-    turned: Rad = 0.0  # in all, and the middle of the play in it
-    middle: Rad = 0.0
+    in_play: Rad = 0.0  # heading from the middle of the play, within `ErrorModel.play`
     astray: Metres = 0.0  # standard deviation to all sides
 
     @classmethod
-    def initial(cls, model: ErrorModel) -> Uncertainty:
+    def initial(cls, model: ErrorModel, pose: Pose) -> Uncertainty:
         columns = [ORIGIN] * CAUSES
-        return cls(model.start, model.start, Bend(model.start, columns), columns)
+        return cls(model.start, model.start, Bend(model.start, columns, pose), columns, pose)
 
     def lose(self) -> None:
         """Make the pose unknown until it is set."""
         self.p = self.covariance = UNKNOWN_POSE
 
-    def update(self, model: ErrorModel, yaw: Rad, *, slips: bool, by_gyro: bool) -> None:
-        """End the stretch, at the end of which the robot has the heading `yaw`."""
-        stretch, self.stretch = self.stretch, Stretch()
-        distance, turn, dx, dy = stretch.distance, stretch.turn, stretch.dx, stretch.dy
-        if stretch.lines and stretch.seconds:
-            self.period = max(MIN_PERIOD_S, stretch.seconds / stretch.lines)
+    def update(
+        self, model: ErrorModel, pose: Pose, path: Path, *, slips: bool, by_gyro: bool
+    ) -> None:
+        """Add the errors of the stretch since the last update."""
+        distance, turn = path.way - self.path.way, path.turned - self.path.turned
+        dx, dy = pose.x - self.pose.x, pose.y - self.pose.y
+        gyro_variance = path.gyro_variance - self.path.gyro_variance
+        if self.seconds:
+            self.period = max(MIN_PERIOD_S, self.seconds / (path.lines - self.path.lines))
+        self.pose, self.path, self.seconds = pose, path, 0.0
         if not (distance or turn or dx or dy) or self._is_lost():
             return
-        heading = yaw - turn / 2
+        heading = pose.yaw - turn / 2
         c, s = math.cos(heading), math.sin(heading)
         along, turning, both = model.noise(distance, turn, self._beyond_play(model, turn))
         if slips:
             along, turning, both = SLIP_FACTOR * along, SLIP_FACTOR * turning, SLIP_FACTOR * both
         if by_gyro:
-            turning, both = stretch.gyro_variance, 0.0
+            turning, both = gyro_variance, 0.0
         p = carried(self.p, dx, dy, turning / 2)  # half of the noise of the turn comes before
         self.p = added(p, along, turning / 2, both, c, s)
         columns = []
@@ -248,8 +241,6 @@ class Uncertainty(Struct):
             columns.append((x + c * further - dy * lever, y + s * further + dx * lever,
                             turned + more))  # fmt: skip
         self.columns, bend = columns, self.bend
-        bend.dx += dx
-        bend.dy += dy
         bend.rolled += abs(distance) + model.track / 2 * abs(turn)
         if bend.rolled > BEND_M:
             self._bend(model)
@@ -326,13 +317,9 @@ class Uncertainty(Struct):
     def _beyond_play(self, model: ErrorModel, turn: Rad) -> Rad:
         # The sum of |turn| of a straight drive would count the play as turning, and make the
         # variance of yaw 2 to 4 times too large.
-        self.turned += turn
-        off = self.turned - self.middle
-        if abs(off) <= model.play:
-            return 0.0
-        beyond = abs(off) - model.play
-        self.middle += math.copysign(beyond, off)
-        return beyond
+        off = self.in_play + turn
+        self.in_play = max(-model.play, min(off, model.play))
+        return abs(off - self.in_play)
 
     def _bend(self, model: ErrorModel) -> None:
         # Composes the error e of the path before a stretch with its own w (Baker, Campbell,
@@ -340,10 +327,10 @@ class Uncertainty(Struct):
         # have noise, and the effects J and W of the causes, which are the same in each stretch.
         # Compare equation 55 of Barfoot & Furgale, IEEE Transactions on Robotics 30 (2014).
         bend, p, columns = self.bend, self.p, self.columns
-        dx, dy = bend.dx, bend.dy
+        dx, dy = self.pose.x - bend.pose.x, self.pose.y - bend.pose.y
         before = carried(bend.p, dx, dy, 0.0)
         j = [(x - dy * yaw, y + dx * yaw, yaw) for x, y, yaw in bend.columns]
-        self.bend = new = Bend(p, columns, 0.0, 0.0, 0.0, bend.noise, bend.of_causes, bend.added)
+        self.bend = new = Bend(p, columns, self.pose, 0.0, bend.noise, bend.of_causes, bend.added)
         total = _total(before, j)
         if self.covariance.yawyaw > MAX_HEADING_VARIANCE:
             return
