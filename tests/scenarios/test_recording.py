@@ -31,7 +31,7 @@ SLOW_LIMITS = replace(PLAIN, limits=replace(PLAIN.limits, linear_speed=0.3))
 def test_a_replay_counts_lines_and_commands_as_the_daemon_did() -> None:
     tape, world = recorded_world(PLAIN)
     world.drive(0.3, seconds=0.5)
-    world.send_together([0.2, 0.3])
+    world.send_together([0.3, 0.2])
     world.port.blocked = True
     world.run(0.05)
     world.port.blocked = False
