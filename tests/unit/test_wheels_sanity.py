@@ -103,7 +103,7 @@ ROWS: dict[str, Row] = {
     "one count of 16 in 4 ms": (
         80, 1500, lines(98.17, 98.17, 0, 98.17, dt=0.00333, step=98.17), "....",
     ),
-    "unknown, but over the limit": (80, 1500, lines(0, 79.9, 80.1, step=UNKNOWN), "..x"),
+    "unknown, but over the limit": (80, 1500, lines(0, 84.9, 85.1, step=UNKNOWN), "..x"),
     "unknown, from the first line": (80, 1500, lines(99, 99, 99, step=UNKNOWN), "xxF"),
     # One count of 16 in 10 ms is 39.27 rad/s; 39.3 are allowed, because lines have rounded speeds.
     "unknown, one count of 16": (10, 1500, lines(39.27, 4, step=UNKNOWN), ".."),

@@ -15,7 +15,7 @@ from operator import sub
 
 from msgspec import Struct
 
-from acsard.core.link.coarse_encoders import COARSEST_COUNT, MIN_COUNT_S
+from acsard.core.link.coarse_encoders import COARSEST_COUNT, JUMP_SPEED, MIN_COUNT_S
 from acsard.core.link.codec import Motors
 from acsard.core.link.feedback import Line
 from acsard.core.values import WHEELS, Event, RadPerS, WheelSpeeds
@@ -146,9 +146,10 @@ class Sanity(Struct):
         known = line.step < math.inf
         # The pose fills the time of the impossible lines before this one with its speeds.
         dropped_s = max(0.0, self.since - max(line.dt, line.since))
-        # While the encoders are unknown, a line has one count of the coarsest encoder at most.
-        # A line without a known time moves nothing, so no count in it is excused.
-        most = max(fastest, COARSEST_COUNT / usual if own > 0.0 else 0.0)
+        # While the encoders are unknown, a line has one count of the coarsest encoder at most, or
+        # one of a fine encoder that the board has counted for less time. A line without a known
+        # time moves nothing, so no count in it is excused.
+        most = max(fastest + JUMP_SPEED, COARSEST_COUNT / usual) if own > 0.0 else fastest
         beyond, speeds = list(self.beyond), line.speeds.as_tuple()
         for wheel, now in enumerate(speeds):
             size, time, count = abs(now), usual, min(line.step * usual, COARSEST_COUNT)
