@@ -24,7 +24,7 @@ from acsard.core.messages.keys_and_roles import (
     source_keys,
 )
 from acsard.core.messages.permissions import COMMAND_ROLE, Use, has, keys_for, least_role
-from acsard.core.ros.transports import PARAMETERS_PREFIX, Endpoint, claims, endpoints, left_out
+from acsard.core.ros.transports import PARAMETERS_PREFIX, Endpoint, claims, endpoints, unused_keys
 from acsard.core.values import ROLES, ROOT_KEY, Role
 
 # Messages that a daemon sends, except `put` (data), which has separate rules.
@@ -94,7 +94,7 @@ class _Keys:
     def __init__(self, config: Config) -> None:
         robot = config.robot.id
         self._robot, self._sources = robot, [source.name for source in config.commands.sources]
-        self._ros = ros = endpoints(config.ros, "*", left_out(config) & {IMU})
+        self._ros = ros = endpoints(config.ros, "*", unused_keys(config) & {IMU})
         topics, outgoing = offered(config), published(config)
         # The gyro's row is not here with the simulator, because the daemon then publishes its key.
         self._incoming = [topic for topic in topics if topic not in outgoing]

@@ -12,7 +12,7 @@ from acsard.core.messages.keys_and_roles import COMMANDS, by_key, source_keys
 from acsard.core.messages.schema import TopicInfo, Topics
 from acsard.core.ros.names import full_name
 from acsard.core.ros.parameters import SETTING_SERVICES
-from acsard.core.ros.transports import left_out, ros_names
+from acsard.core.ros.transports import ros_names, unused_keys
 from acsard.terminal.output import show, table
 
 
@@ -38,7 +38,7 @@ def ros_table(config: Config) -> Topics:
     ros = config.ros
     known = source_keys(source.name for source in config.commands.sources)
     rows = []
-    for row in ros_names(left_out(config)) if ros.bridge or ros.rmw else ():
+    for row in ros_names(unused_keys(config)) if ros.bridge or ros.rmw else ():
         native = by_key(row.native)
         note = f"as {row.native}" + (f": {native.note}" if native else "")
         if row.direction == "query":

@@ -66,7 +66,7 @@ def summary(robot: Robot, now_ns: Ns) -> Snapshot:
         sources=sources,
         refused_age_s=None if refused_ns is None else (now_ns - refused_ns) / NS_PER_S,
         gyro_bias=gyro.bias,
-        left_out=wheels.left_out,
+        excluded=wheels.excluded,
         slipping=wheels.slipping,
         port_released=state.life.port_released,
         bumper=inputs.bumpers.why(config.safety),

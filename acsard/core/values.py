@@ -308,7 +308,7 @@ class WheelsStatus(Struct, frozen=True):
     """The verdicts on the wheels that are no reason to stop."""
 
     text: str = ""
-    left_out: tuple[str, ...] = ()  # wheels that the odometry ignores
+    excluded: tuple[str, ...] = ()  # wheels that the odometry ignores
     slipping: tuple[str, ...] = ()  # sides, `left` or `right`, within half a second
 
 

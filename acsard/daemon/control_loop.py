@@ -36,9 +36,9 @@ MIN_WRITE_DELAY_NS = 1_000_000
 LOOK_NS = NS_PER_S // 10
 
 # The line on the port, why the guard replaced the robot's, and how late it was written.
-Left = tuple[bytes | None, Trip, Ns]
+Written = tuple[bytes | None, Trip, Ns]
 
-NOTHING_LEFT: Left = None, "", 0
+NOTHING_WRITTEN: Written = None, "", 0
 
 
 # The result of a wake-up: its time, what the robot makes of it, whether a line was due (the period
@@ -91,7 +91,7 @@ class ControlLoop:
         robot, publication, pace = self.robot, self.publication, self.pace
         port, keeper, recorder = self._port, self._keeper, self._recorder
         heard: Heard | None = None
-        tick, line, left = False, None, NOTHING_LEFT
+        tick, line, written = False, None, NOTHING_WRITTEN
         publication.now = now
         try:
             heard = self._heard(now, period)
@@ -108,7 +108,7 @@ class ControlLoop:
             if due:
                 line = robot.drive(now)
                 if line is not None:
-                    left = self._write(line, now, news.urgent)
+                    written = self._write(line, now, news.urgent)
         except Exception:
             # Store the stops that this wake-up has taken from the bus. The exception may have come
             # before the robot processed them.
@@ -118,9 +118,11 @@ class ControlLoop:
             raise
         had_input = bool(heard.commands or heard.refusals or heard.requests)
         if had_input or news.urgent or period is not NO_PERIOD or pace.waiting:
-            pace.record_step(tick, due, left[0] is not None, news.urgent, had_input, port.sent_ns)
+            pace.record_step(
+                tick, due, written[0] is not None, news.urgent, had_input, port.sent_ns
+            )
         if recorder is not None:
-            step = now, heard, due, line, *left, news, robot.status
+            step = now, heard, due, line, *written, news, robot.status
             recorder.step(step, robot, self._guard)
         publication.stopwatch.step_time(self._mono_ns() - now.mono_ns)
         # Publish last, because the threads that send need this core and Python's interpreter lock,
@@ -158,7 +160,7 @@ class ControlLoop:
             self.shutting_down,
         )
 
-    def _write(self, line: bytes, now: Instant, urgent: bool) -> Left:
+    def _write(self, line: bytes, now: Instant, urgent: bool) -> Written:
         # The guard may replace the line, and the port may drop it.
         robot, port, guard = self.robot, self._port, self._guard
         status, command_ns = robot.status, robot.command_ns

@@ -315,9 +315,9 @@ class LatchFile(Keeper):
         self._lock = lock
         # Remove the temporary files of processes that were killed while they wrote.
         with suppress(OSError):
-            for left in path.parent.glob(f".{path.name}.*"):
+            for temporary in path.parent.glob(f".{path.name}.*"):
                 with suppress(OSError):
-                    left.unlink()
+                    temporary.unlink()
 
     # The control loop calls the methods below.
 

@@ -29,7 +29,7 @@ from acsard.core.ros.channels import (
     published_channels,
 )
 from acsard.core.ros.shapes import Log, log
-from acsard.core.ros.transports import left_out
+from acsard.core.ros.transports import unused_keys
 
 
 class EventDeduplicator:
@@ -89,7 +89,7 @@ class Relay:
 
     def offer(self, config: Config) -> None:
         """Offer the robot's topics to the viewers. Topics that were offered before remain."""
-        for row in published_channels(left_out(config)):
+        for row in published_channels(unused_keys(config)):
             if row is CMD_VEL_IN:
                 continue  # only recordings contain the commands of other programs
             topic = row.topic(config.ros.namespace)

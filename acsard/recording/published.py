@@ -25,7 +25,7 @@ from acsard.core.messages.schema import (
 from acsard.core.robot import Robot
 from acsard.core.ros.channels import BY_KEY, CMD_VEL_IN, IMU_CHANNEL, LOG_CHANNEL, Channel
 from acsard.core.ros.shapes import LEVELS, Log, command_message
-from acsard.core.ros.transports import left_out
+from acsard.core.ros.transports import unused_keys
 from acsard.core.summary import summary
 from acsard.core.values import Command, GyroSample, Instant, News, WallNs
 from acsard.recording.file import Recording
@@ -96,7 +96,7 @@ class Publisher:
         # At the first step, and after a change of a setting.
         if self._config is not self._static and "tf_static" in self._keys:
             self._static = self._report.config = self._config
-            if "tf_static" not in left_out(self._config):
+            if "tf_static" not in unused_keys(self._config):
                 message = self._report.tf_static()
                 yield Published(BY_KEY["tf_static"], "", step.now.wall_ns, message)
 

@@ -82,7 +82,7 @@ class Findings(Struct):
     first: dict[str, float] = {}
     faults: list[str] = []
     pushes: int = 0
-    left_out: set[str] = set()
+    excluded: set[str] = set()
 
 
 class Bench:
@@ -155,7 +155,7 @@ class Bench:
             said.first.setdefault(wheels.fault.code, self.now)
             said.faults.append(wheels.fault.code)
         said.pushes += bool(wheels.pushed)
-        said.left_out.update(WHEELS[side.out] for side in wheels.sides if side.out >= 0)
+        said.excluded.update(WHEELS[side.out] for side in wheels.sides if side.out >= 0)
 
     def hold(self, wished: Twist, seconds: float) -> None:
         for _ in range(max(1, round(seconds * self.robot.rate))):

@@ -11,7 +11,7 @@ from msgspec.structs import replace
 from acsard.cli import main
 from acsard.cli.topics import ros_table
 from acsard.core.config.settings import CommandsConfig, Config, RosConfig, Source
-from acsard.core.ros.transports import PARAMETERS_PREFIX, left_out, ros_names
+from acsard.core.ros.transports import PARAMETERS_PREFIX, ros_names, unused_keys
 from acsard.host.processes import Holder
 from acsard.machine.serial_ports import SerialDevice
 
@@ -19,7 +19,7 @@ from acsard.machine.serial_ports import SerialDevice
 def test_every_ros_name_is_listed_with_what_it_stands_for() -> None:
     table = ros_table(Config(ros=RosConfig(namespace="robot1")))
     rows = [(row.key, row.direction, row.type) for row in table.topics]
-    names = ros_names(left_out(Config()))
+    names = ros_names(unused_keys(Config()))
     assert rows == [(f"/robot1/{n.name}", n.direction, n.type) for n in names]
     for row, name in zip(table.topics, names, strict=True):
         if not name.native.startswith(PARAMETERS_PREFIX):

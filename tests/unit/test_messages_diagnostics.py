@@ -91,7 +91,7 @@ SITUATIONS: dict[str, tuple[Config, dict[str, Any]]] = {
     "a refused source": (CONFIG, {"refused_age_s": SHOW_REFUSAL_S / 2}),
     "a source refused long ago": (CONFIG, {"refused_age_s": SHOW_REFUSAL_S}),
     "a left out and a slipping wheel": (
-        CONFIG, {"wheel_fault": "rear_left is left out", "left_out": ("rear_left",),
+        CONFIG, {"wheel_fault": "rear_left is left out", "excluded": ("rear_left",),
                  "slipping": ("right",)},
     ),
     "no encoders": (

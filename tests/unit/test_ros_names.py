@@ -40,8 +40,8 @@ from acsard.core.ros.transports import (
     claims,
     command_keys,
     endpoints,
-    left_out,
     node_tokens,
+    unused_keys,
 )
 from tests.each import each
 from tests.promised import PROMISED
@@ -304,12 +304,12 @@ def test_every_endpoint_with_a_single_type_has_its_own_token() -> None:
 
 def test_what_a_robot_does_not_publish_or_use_has_no_endpoint() -> None:
     gyro = OdometryConfig(gyro=True)
-    assert left_out(Config(mcu=REAL, odometry=gyro)) == set()
-    assert left_out(Config(mcu=REAL)) == left_out(Config(odometry=gyro)) == {"imu"}
+    assert unused_keys(Config(mcu=REAL, odometry=gyro)) == set()
+    assert unused_keys(Config(mcu=REAL)) == unused_keys(Config(odometry=gyro)) == {"imu"}
     odometry = OdometryConfig(publish_tf=False, gyro=True)
     off = Config(mcu=REAL, odometry=odometry, lidar=LidarConfig(publish_tf=False))
-    assert left_out(off) == {"tf", "tf_static"}
-    present = {e.native for e in endpoints(RosConfig(), ZID, left_out(off))}
+    assert unused_keys(off) == {"tf", "tf_static"}
+    present = {e.native for e in endpoints(RosConfig(), ZID, unused_keys(off))}
     assert {e.native for e in all_endpoints()} - present == {"tf", "tf_static"}
 
 

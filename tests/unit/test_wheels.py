@@ -57,7 +57,7 @@ class Bench:
         `turn` is the gyro's rate, rad/s. In every second line `noise` is added to a turning wheel.
         """
         time_s, wheels = math.inf, self.wheels
-        before, wanted = wheels.status.left_out, None if command is None else speeds_of(command)
+        before, wanted = wheels.status.excluded, None if command is None else speeds_of(command)
         for number in range(round(seconds / each)):
             more = noise * (number % 2)
             a, b, c, d = (s + more * (s != 0.0) for s in speeds_of(speeds).as_tuple())
@@ -66,7 +66,7 @@ class Bench:
             wheels.commanded, wheels.late = wanted, late
             reported = WheelSpeeds(a, b, c, d)
             wheels.add(turned, reported, each, by_gyro, self.feedback, self.kinematics, self.count)
-            if wheels.status.left_out != before:
+            if wheels.status.excluded != before:
                 time_s = min(time_s, (number + 1) * each)
             self.events += [event.kind for event in wheels.events]
             self.pushes += bool(wheels.pushed)
@@ -178,7 +178,7 @@ def test_both_wheels_of_a_side_that_report_no_turn_may_have_turned() -> None:
 def test_a_faulty_wheel_is_left_out_within_60_ms_and_named(wheel: int, speed: float) -> None:
     bench = Bench().driven()
     assert bench.run(only(wheel, speed), 10.0, 1.0) <= 0.06
-    assert bench.wheels.status.left_out == (WHEELS[wheel],)
+    assert bench.wheels.status.excluded == (WHEELS[wheel],)
     # The other wheel of the side replaces it, and no other speed changes.
     believed = bench.wheels.believed((1, 2, 3, 4))
     expected = [1.0, 2.0, 3.0, 4.0]
@@ -190,7 +190,7 @@ def test_one_wheel_of_each_side_can_be_left_out_but_never_both_of_a_side() -> No
     bench = Bench().driven()
     for speeds in (WheelSpeeds(0.0, 0.0, 10.0, 10.0), 0.0):
         bench.run(speeds, 10.0, 1.0)
-        assert bench.wheels.status.left_out == ("front_left", "front_right")
+        assert bench.wheels.status.excluded == ("front_left", "front_right")
 
 
 def test_a_wheel_that_was_left_out_counts_again_once_it_has_agreed_for_two_seconds() -> None:
@@ -198,7 +198,7 @@ def test_a_wheel_that_was_left_out_counts_again_once_it_has_agreed_for_two_secon
     bench.run(only(2, 0.0), 10.0, 1.0)
     for speed, seconds, out in ((0.0, 5.0, True), (10.0, 1.5, True), (10.0, 1.0, False)):
         bench.run(speed, speed, seconds)  # at rest it agrees with every other
-        assert bench.wheels.status.left_out == ("rear_left",) * out
+        assert bench.wheels.status.excluded == ("rear_left",) * out
     assert [kind for kind in bench.events if kind != "wheel_blocked"][:2] == ["left out", "again"]
 
 
@@ -217,10 +217,10 @@ def test_a_push_leaves_no_wheel_out_unless_a_gyro_shows_one(pushed: float, wheel
     for speeds in (only(wheel, 0.0, pushed), only(wheel, pushed, 0.0)):
         bench = Bench()
         assert bench.run(speeds, 0.0, 5.0, noise=0.1) == math.inf
-        assert bench.wheels.status.left_out == ()
+        assert bench.wheels.status.excluded == ()
     bench = Bench()
     assert bench.run(only(wheel, 0.0, 5.0), 0.0, 1.0, turn=0.0) <= 0.06
-    assert bench.wheels.status.left_out == (WHEELS[wheel],)
+    assert bench.wheels.status.excluded == (WHEELS[wheel],)
 
 
 # slip

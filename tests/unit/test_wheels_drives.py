@@ -39,7 +39,7 @@ def test_sound_robots_latch_no_fault(robots: int, seconds: float) -> None:
     pushes = 0
     for seed in range(robots):
         made, said = sound(seed, seconds)
-        assert (said.faults, said.left_out) == ([], set()), (seed, made, said)
+        assert (said.faults, said.excluded) == ([], set()), (seed, made, said)
         pushes += said.pushes
     assert pushes
 
@@ -63,7 +63,7 @@ def bench(counts: int, speed: float, dice: random.Random) -> Bench:
 
 
 def until(driven: Bench, happened: str) -> float:
-    """Drive on until `left_out` or `slipping` of the status is not empty. Return the time, s."""
+    """Drive on until `excluded` or `slipping` of the status is not empty. Return the time, s."""
     begun = driven.now
     while driven.now - begun < 3.0:
         driven.step(Twist(driven.robot.speed))
@@ -92,8 +92,8 @@ def test_the_time_to_leave_a_faulty_encoder_out_depends_on_counts_and_speed(
             driven.dead.add(wheel)
         else:
             driven.signs[wheel] = -1
-        times.append(until(driven, "left_out"))
-        assert driven.wheels.status.left_out == (WHEELS[wheel],)
+        times.append(until(driven, "excluded"))
+        assert driven.wheels.status.excluded == (WHEELS[wheel],)
     print(f"\n{kind}, {counts} counts, {speed:g} rad/s: {max(times):.2f} s")
     assert max(times) <= within + 1e-9
 
@@ -112,7 +112,7 @@ def test_an_hour_of_clean_driving_raises_one_false_alarm_at_most(counts: int, se
                 driven.step(wished)
                 was, slips = slips, bool(driven.wheels.status.slipping)
                 alarms += slips and not was
-        assert driven.said.left_out == set()
+        assert driven.said.excluded == set()
     print(f"\n{counts} counts, {seconds} s: {alarms} false alarms")
     assert alarms <= 1
 

@@ -88,11 +88,11 @@ def warnings(config: Config) -> list[str]:
     if config.safety.needs_bumpers:
         required = required or f"safety.bumpers = {show(config.safety.bumpers)}"
     if required and use + status_use > 1.0:
-        left = highest_rate(config.mcu.baud_rate, count, COMFORTABLE_USE - status_use)
+        possible_hz = highest_rate(config.mcu.baud_rate, count, COMFORTABLE_USE - status_use)
         messages.append(
             f"{required} needs status lines, which take {status_use:.0%} of the wire at "
             f"{config.mcu.baud_rate} baud. The replies at control.rate = {config.rate_hz:g} do "
-            f"not fit beside them; write control.rate = {left} or less"
+            f"not fit beside them; write control.rate = {possible_hz} or less"
         )
     if config.bus.insecure:
         messages.append(

@@ -78,7 +78,7 @@ def _dotted(text: str, keys: Mapping[str, object]) -> tuple[str, dict[str, objec
 
     # tomlkit cannot insert such keys: it would put a table header between the dotted keys.
     document = tomlkit.parse(text)
-    lines, left = text.splitlines(keepends=True), dict(keys)
+    lines, remaining = text.splitlines(keepends=True), dict(keys)
     for key, value in keys.items():
         table = key.partition(".")[0]
         top = next((n for n, s in enumerate(lines) if s.lstrip().startswith("[")), len(lines))
@@ -86,8 +86,8 @@ def _dotted(text: str, keys: Mapping[str, object]) -> tuple[str, dict[str, objec
         if not places or _has(document, key):
             continue
         lines.insert(places[0], f"{key} = {write(value)}\n")
-        del left[key]
-    return "".join(lines), left
+        del remaining[key]
+    return "".join(lines), remaining
 
 
 def _has(document: object, key: str) -> bool:

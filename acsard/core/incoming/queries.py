@@ -60,7 +60,7 @@ from acsard.core.ros.parameters import (
     requested_values,
 )
 from acsard.core.ros.shapes import Trigger
-from acsard.core.ros.transports import PARAMETERS_PREFIX, left_out
+from acsard.core.ros.transports import PARAMETERS_PREFIX, unused_keys
 from acsard.core.values import ROLES, Answer, Ns, Request, Status, WallNs
 
 Current = Callable[[str], Message | None]
@@ -288,7 +288,7 @@ def offered_services() -> dict[str, list[str]]:
 
 def topic_table(config: Config) -> Topics:
     """Return the daemon's keys, as full keys, without those on which it never sends."""
-    robot, silent = config.robot.id, left_out(config)
+    robot, silent = config.robot.id, unused_keys(config)
     return Topics(
         [
             TopicInfo(full_key(robot, t.key), t.direction, t.type, t.rate, t.note)

@@ -277,7 +277,7 @@ def _wheels(config: Config, snapshot: Snapshot) -> Row:
     if not config.feedback.encoders:
         advice = "if the robot has encoders, set feedback.encoders = true"
     values = {
-        "left_out": ", ".join(snapshot.left_out),
+        "left_out": ", ".join(snapshot.excluded),
         "slipping": ", ".join(snapshot.slipping),
     }
     values |= _counted(counters, "wheel_fault") | _counted(counters, "uncommanded_motion")

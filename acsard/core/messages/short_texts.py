@@ -58,11 +58,11 @@ def _state(state: RobotState) -> list[str]:
     code = f" [{state.code}]" if state.code else ""
     why = printable(after_mode(state.mode, state.reason) + code + cause_numbers(state))
     parts = [*place(state.x, state.y, state.yaw), *speeds(state.linear, state.angular), why]
-    left = charge(state.battery)
+    battery = charge(state.battery)
     problems = "; ".join(map(str, warnings(state)))
     return [
         *parts,
-        *filter(None, (left and f"battery {left}", problems and f"{WARNING}: {problems}")),
+        *filter(None, (battery and f"battery {battery}", problems and f"{WARNING}: {problems}")),
     ]
 
 

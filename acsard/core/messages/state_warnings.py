@@ -83,9 +83,9 @@ def _warnings(state: RobotState) -> Iterator[StateWarning]:
         noun = "bumpers" if len(pressed) > 1 else "bumper"
         yield StateWarning("bumper", f"{noun} {' and '.join(pressed)} pressed")
     if state.battery is not None and state.battery.level in BATTERY:
-        left = charge(state.battery)
+        battery = charge(state.battery)
         words = BATTERY[state.battery.level]
-        yield StateWarning("battery", f"{words} ({left})" if left else words)
+        yield StateWarning("battery", f"{words} ({battery})" if battery else words)
     if CERTIFICATE_LEVELS.get(state.certificate):
         yield StateWarning("certificate", f"certificate {state.certificate_expiry}")
     if state.recording_error:

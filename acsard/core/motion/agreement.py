@@ -96,7 +96,7 @@ class Compared(Struct):
 
 class Agreement(Struct):
     verdict: Verdict = "none yet"
-    disagrees_s: Seconds = 0.0  # left
+    disagrees_s: Seconds = 0.0  # remaining
     block: Compared = field(default_factory=Compared)
     straight: Compared = field(default_factory=Compared)
     short: Compared = field(default_factory=Compared)  # turns; the test of a gyro, too

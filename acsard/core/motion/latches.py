@@ -36,8 +36,8 @@ def stopped(latches: Latches, by: str, wall_ns: WallNs) -> Latches:
 
 def released(latches: Latches, numbers: Collection[int]) -> Latches:
     """Return the latches without the causes that have these numbers."""
-    left = tuple([cause for cause in latches.causes if cause.number not in numbers])
-    return replace(latches, causes=left)
+    remaining = tuple([cause for cause in latches.causes if cause.number not in numbers])
+    return replace(latches, causes=remaining)
 
 
 def after_restart(latches: Latches) -> Latches:

@@ -141,12 +141,9 @@ class Lifecycle(Struct):
             self._require_shown(causes, asked_ns, "clear")
             numbers = [c.number for c in self.latches.of("fault") or causes]
         done = self._release(numbers, causes, "clear")
-        left = self.latches.of("fault", "stop")
-        if left:
-            text = (
-                f"cleared, but the robot is still {in_force(left)}: type `acsard call clear` again"
-            )
-            return text, done
+        if others := self.latches.of("fault", "stop"):
+            still = in_force(others)
+            return f"cleared, but the robot is still {still}: type `acsard call clear` again", done
         if self.latches.causes:
             return (
                 "cleared, but the robot is still switched off: type `acsard call activate` to "

@@ -89,7 +89,7 @@ class Odometry(Struct):
         checks.check_line(model, line, rolled, whole, known=gap is None or not gap.unknown)
         turn, slips = checks.turn, checks.slips
 
-        believed = wheels.believed(reported) if wheels.leaves_out else reported
+        believed = wheels.believed(reported) if wheels.excludes else reported
         self.rested = self.rested + line.dt - line.bridged if believed == AT_REST else 0.0
         at_rest = self.rested > REST_S
         if self.held != AT_REST or (at_rest and rolled != AT_REST):
@@ -97,7 +97,7 @@ class Odometry(Struct):
         self.positions = plus(self.positions, rolled)
         moved = model.kinematics.moved
         linear, angular = moved(believed)
-        if wheels.leaves_out:
+        if wheels.excludes:
             distance, angle = moved(plus(wheels.believed(rolled), wheels.repair))
         else:
             distance, angle = moved(rolled)

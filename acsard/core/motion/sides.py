@@ -122,7 +122,7 @@ class Side(Struct):
         self.good_s = 0.0
         if self.out >= 0:
             return None
-        if self._leave_out(block, low, high, same_s):
+        if self._exclude(block, low, high, same_s):
             return Event("wheel_fault", self.out_text, "warning", kind="left out")
         if self._slips(block):
             before, self.slipped_s, self.slip_s = self.slipped_s, self.slipped_s + s, SLIP_S
@@ -160,9 +160,7 @@ class Side(Struct):
                 return Event("wheel_fault", text, kind="again")
         return None
 
-    def _leave_out(
-        self, block: Block, low: Rad, high: Rad, same_s: tuple[Seconds, Seconds]
-    ) -> bool:
+    def _exclude(self, block: Block, low: Rad, high: Rad, same_s: tuple[Seconds, Seconds]) -> bool:
         # A wheel is left out if it shows a sign of a faulty encoder, and is farther from what a
         # healthy one rolls by a third of the difference.
         if low * high <= 0.0 or max(low / high, high / low) > TURNING:

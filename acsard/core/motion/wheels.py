@@ -120,7 +120,7 @@ class Wheels(Struct):
     lines: int = 0
     apart: Rad = 0.0  # of front and rear in one block, beyond which it ends early
     unreported_s: Seconds = REPEATED_S
-    leaves_out: bool = False
+    excludes: bool = False
     slips: bool = False  # the wheels of a side contradict each other
     missed: tuple[tuple[SideName, Motors], ...] = ()  # by both wheels of a side
     repair: Motors = NOTHING  # what the pose still has of a wheel that is left out now, rad
@@ -182,7 +182,7 @@ class Wheels(Struct):
 
     def believed(self, wheels: Motors) -> Motors:
         """Return angles or speeds, with the other wheel of its side for one that is left out."""
-        if not self.leaves_out:
+        if not self.excludes:
             return wheels
         values = list(wheels)
         for side in self.sides:
@@ -196,7 +196,7 @@ class Wheels(Struct):
         Call this once for each line. A wheel that is left out may be blocked, or its motor may be
         reversed; two wheels of a side that do not obey may have two faulty encoders.
         """
-        if not (self.leaves_out or self.missed):
+        if not (self.excludes or self.missed):
             return []
         found, self.missed = list(self.missed), ()
         for side in self.sides:
@@ -213,8 +213,8 @@ class Wheels(Struct):
         slipping = [side for side in self.sides if side.slip_s]
         texts = [side.out_text for side in out] + [side.slip_text for side in slipping]
         texts += [_text(wheel, i) for i, wheel in enumerate(self.wheels) if wheel.warning]
-        left_out, names = [WHEELS[side.out] for side in out], [side.name for side in slipping]
-        return WheelsStatus("; ".join(texts), tuple(left_out), tuple(names))
+        excluded, names = [WHEELS[side.out] for side in out], [side.name for side in slipping]
+        return WheelsStatus("; ".join(texts), tuple(excluded), tuple(names))
 
     def _begin(self) -> None:
         self.angles, self.seconds, self.lines, self.turn, self.by_gyro = NOTHING, 0.0, 0, 0.0, True
@@ -409,8 +409,8 @@ class Wheels(Struct):
                 self.repair = _motors(repair)
             if event is not None:
                 self.events = (*self.events, event)
-        self.leaves_out = left.out >= 0 or right.out >= 0
-        self.slips = self.leaves_out or left.slip_s > 0.0 or right.slip_s > 0.0
+        self.excludes = left.out >= 0 or right.out >= 0
+        self.slips = self.excludes or left.slip_s > 0.0 or right.slip_s > 0.0
 
 
 def new_wheels() -> Wheels:

@@ -241,5 +241,5 @@ CHANNELS: tuple[Channel, ...] = (*BY_KEY.values(), CMD_VEL_IN, LOG_CHANNEL)
 
 
 def published_channels(silent: Container[str]) -> tuple[Channel, ...]:
-    """Return all channels but those whose native key is in `silent` (`left_out`)."""
+    """Return all channels but those whose native key is in `silent` (`unused_keys`)."""
     return tuple(channel for channel in CHANNELS if channel.native not in silent)

@@ -110,7 +110,7 @@ SPEED_LIMIT_TOPIC = RosName(SPEED_LIMIT, SPEED_LIMIT, "in", "nav2_msgs/msg/Speed
 GYRO_TOPIC = RosName("imu/data", IMU, "in", "sensor_msgs/msg/Imu", Qos(best_effort=True))
 
 
-def left_out(config: Config) -> frozenset[str]:
+def unused_keys(config: Config) -> frozenset[str]:
     """Return the native keys that are not used, and so not announced to ROS."""
     silent = set() if config.odometry.publish_tf else {"tf"}
     # The simulated robot has its own gyro, so the daemon does not subscribe to another one.
@@ -122,7 +122,7 @@ def left_out(config: Config) -> frozenset[str]:
 
 
 def ros_names(silent: Container[str] = ()) -> tuple[RosName, ...]:
-    """Return the ROS names, without namespace and native keys in `silent` (`left_out`).
+    """Return the ROS names, without namespace and native keys in `silent` (`unused_keys`).
 
     One for Twist and TwistStamped appears twice.
     """

@@ -19,7 +19,7 @@ from acsard.core.incoming.imu import SIMULATOR_SENDER
 from acsard.core.messages.keys_and_roles import IMU, Topic, full_key, json_key, offered, published
 from acsard.core.messages.signature import Signature
 from acsard.core.ros.names import gid
-from acsard.core.ros.transports import Endpoint, claims, endpoints, left_out, node_tokens
+from acsard.core.ros.transports import Endpoint, claims, endpoints, node_tokens, unused_keys
 from acsard.core.values import NS_PER_S
 from acsard.daemon.bus.inbox import Inbox, Replies
 from acsard.daemon.bus.outlets import Outlets
@@ -94,7 +94,7 @@ class ZenohBus:
         self._replies.start(session)
         self._declare_native(session)
         zid = str(session.zid())
-        for endpoint in endpoints(ros, zid, left_out(config)):
+        for endpoint in endpoints(ros, zid, unused_keys(config)):
             self._declare_ros(session, endpoint)
         for token in (self._alive, *claims(ros), *node_tokens(ros, zid)):
             self._entities.append(session.liveliness().declare_token(token))

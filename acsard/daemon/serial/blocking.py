@@ -81,10 +81,10 @@ class BlockingPort(Wire):
             try:
                 data = data[os.write(fd, data) :]
             except BlockingIOError:
-                left_s = (deadline_ns - clock.mono_ns()) / NS_PER_S
-                if left_s <= 0:
+                remaining_s = (deadline_ns - clock.mono_ns()) / NS_PER_S
+                if remaining_s <= 0:
                     raise WireLostError(f"{self._path} accepts no more bytes") from None
-                select.select([], [fd], [], left_s)
+                select.select([], [fd], [], remaining_s)
             except OSError as error:
                 raise WireLostError(f"{self._path} was lost: {error.strerror}") from error
 
@@ -92,8 +92,8 @@ class BlockingPort(Wire):
         fd = self._fileno()
         pieces: list[tuple[int, bytes]] = []
         while True:
-            left_s = max(0.0, (until_ns - clock.mono_ns()) / NS_PER_S)
-            ready, _, _ = select.select([fd], [], [], left_s)
+            remaining_s = max(0.0, (until_ns - clock.mono_ns()) / NS_PER_S)
+            ready, _, _ = select.select([fd], [], [], remaining_s)
             if not ready:
                 return pieces
             try:
@@ -105,7 +105,7 @@ class BlockingPort(Wire):
             if not data:
                 raise WireLostError(f"{self._path} was unplugged")
             pieces.append((clock.mono_ns(), data))
-            if left_s == 0.0:
+            if remaining_s == 0.0:
                 return pieces
 
     def _fileno(self) -> int:

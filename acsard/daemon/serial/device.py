@@ -22,7 +22,7 @@ from acsard.host.port_access import GETTY, console_advice, denial
 from acsard.host.processes import Holder, holder_of, is_check_here
 from acsard.host.threads import NoThreadError, begin
 
-_left_open: list[int] = []  # descriptors that `close` had no thread for
+_unclosed: list[int] = []  # descriptors that `close` had no thread for
 
 
 class Device(serial.Serial):  # type: ignore[misc]
@@ -62,7 +62,7 @@ def open_raw(path: str, baud_rate: int) -> Device:
     # time.
     with suppress(IndexError):
         while True:
-            _end(_left_open.pop())
+            _end(_unclosed.pop())
     # An inter-byte timeout makes pyserial set VMIN = 1. A read without data then fails with EAGAIN,
     # so an empty read always means a hang-up.
     device = Device(baudrate=baud_rate, inter_byte_timeout=0, exclusive=True)
@@ -180,7 +180,7 @@ def close(device: serial.Serial, *, lost: bool = False, wait_s: float = 0.0) -> 
     try:
         begin(end)
     except NoThreadError:
-        _left_open.append(real)
+        _unclosed.append(real)
         return
     ended.wait(wait_s)
 
