@@ -293,7 +293,7 @@ class Robot:
         )
         link, inputs = session.link, state.inputs
         sent = state.counters.get("lines_sent", 0)
-        if (feedback and sent >= state.unanswered.due) or link != "up":
+        if (feedback and sent >= state.unanswered.due_lines) or link != "up":
             warning = state.unanswered.check(
                 sent,
                 session.good_lines,

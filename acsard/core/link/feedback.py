@@ -137,11 +137,11 @@ class Timeline(Struct):
         came_ns = self.heard_ns = came_ns if came_ns > before_ns else before_ns
         since = (came_ns - before_ns) / NS_PER_S
         if setup.period_ns:
-            due_ns, dt_ns, bridged_ns = self.free_running.place(self.rest, setup.period_ns)
+            expected_ns, dt_ns, bridged_ns = self.free_running.place(self.rest, setup.period_ns)
         else:
             if asked_ns is not None and not self.rest:
                 self.prompted.measure(self.end_ns - asked_ns, self.read_lines, setup.apart_ns)
-            due_ns, dt_ns, bridged_ns = self.prompted.place(
+            expected_ns, dt_ns, bridged_ns = self.prompted.place(
                 out, self.end_ns, asked_ns, setup.apart_ns
             )
         dt, bridged, gap = dt_ns / NS_PER_S, bridged_ns / NS_PER_S, 0.0
@@ -180,10 +180,10 @@ class Timeline(Struct):
                 self.whole.apart = 0.0
         else:
             step = self.coarse.step(wheels, elapsed)
-        due_ns = due_ns if due_ns < came_ns else came_ns
+        expected_ns = expected_ns if expected_ns < came_ns else came_ns
         # Pass the fields by position: creating a struct by its names takes three times as long.
         return Line(
-            self._sampled(due_ns - wire_ns(length, setup.mcu.baud_rate)),
+            self._sampled(expected_ns - wire_ns(length, setup.mcu.baud_rate)),
             speeds,
             dt,
             gap,

@@ -94,8 +94,8 @@ class Lateness(Struct):
         self.deviation += LAG_GAIN * ((-off if off < 0.0 else off) - self.deviation)
 
 
-# The time of a line: when it was due here, the time since the previous one, and the part of that in
-# which lines were lost.
+# The time of a line: when it is expected here, the time since the previous one, and the part of
+# that in which lines were lost.
 Times = tuple[Ns, Ns, Ns]
 
 
@@ -114,14 +114,15 @@ class FreeRunning(Struct):
     window_ns: Ns = 0
     missing: float = 0.0  # among the last `LOSSY_LINES`
     lossy: bool = False
-    due_ns: Ns = 0  # time of the last line of the last read
+    expected_ns: Ns = 0  # time of the last line of the last read
     line_ns: Ns = 0  # that each line of the last read takes
     lost_ns: Ns = 0  # more for the next line; negative: lines before it have taken its time
 
     def process_read(self, end_ns: Ns, since_ns: Ns, lines: int, drained: bool, period: Ns) -> None:
         """Process a read; `drained`: the kernel has no more data."""
         if not self.begun:
-            self.begun, self.window_ns, self.due_ns, self.line_ns = True, end_ns, end_ns, period
+            self.begun, self.line_ns = True, period
+            self.window_ns = self.expected_ns = end_ns
             return
         passed = since_ns / period
         late, lost = self.late + passed - lines, 0
@@ -146,10 +147,10 @@ class FreeRunning(Struct):
         self.missing += lost - self.missing * min(1.0, lines / LOSSY_LINES)
         lossy, usual = self.lossy, self.lateness.usual
         self.lossy = self.missing > LOSSY and self.lateness.deviation >= NARROW_DEVIATION
-        before_ns = self.due_ns - self.lost_ns  # time of the last line that was used
-        self.due_ns = end_ns - int((usual if self.lossy else late) * period)
+        before_ns = self.expected_ns - self.lost_ns  # time of the last line that was used
+        self.expected_ns = end_ns - int((usual if self.lossy else late) * period)
         if lossy or self.lossy:
-            took_ns = self.due_ns - before_ns
+            took_ns = self.expected_ns - before_ns
             self.line_ns, self.lost_ns = max(0, took_ns) // lines, min(0, took_ns)
         else:
             self.line_ns, self.lost_ns = period, self.lost_ns + lost * period
@@ -158,7 +159,7 @@ class FreeRunning(Struct):
         """Return the times of the next line of the last read, `behind` lines before its end."""
         took_ns = self.line_ns + self.lost_ns
         dt_ns, self.lost_ns = max(0, took_ns), min(0, took_ns)
-        return self.due_ns - behind * period, dt_ns, max(0, dt_ns - period)
+        return self.expected_ns - behind * period, dt_ns, max(0, dt_ns - period)
 
     def skip(self) -> None:
         """Skip a line that is not used."""

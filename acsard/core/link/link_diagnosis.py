@@ -181,7 +181,7 @@ class UnansweredLines(Struct):
     """
 
     since: tuple[int, int] | None = None  # lines sent and received at the last comparison
-    due: int = 0  # lines sent at the next one
+    due_lines: int = 0  # lines sent at the next one
     told: bool = False
 
     def check(self, sent: int, good: int, linked: bool, reply_period: float) -> Event | None:
@@ -190,14 +190,14 @@ class UnansweredLines(Struct):
         A board with a `reply_period` answers no line, so none is missing.
         """
         if not linked or reply_period:
-            self.since, self.due, self.told = None, 0, False
+            self.since, self.due_lines, self.told = None, 0, False
             return None
         if self.since is None:
-            self.since, self.due = (sent, good), sent + WINDOW_LINES
+            self.since, self.due_lines = (sent, good), sent + WINDOW_LINES
         lines, answers = sent - self.since[0], good - self.since[1]
         if lines < WINDOW_LINES:
             return None
-        self.since, self.due = (sent, good), sent + WINDOW_LINES
+        self.since, self.due_lines = (sent, good), sent + WINDOW_LINES
         warned, self.told = self.told, answers < (1.0 - MAX_UNANSWERED_FRACTION) * lines
         if warned or not self.told:
             return None

@@ -31,7 +31,7 @@ class PoseDoubt(Struct):
     lines: int = 0
     gaps: int = 0
     coarse: int = 0
-    due: int = WINDOW_LINES  # good lines at the next comparison
+    due_lines: int = WINDOW_LINES  # good lines at the next comparison
 
     def judge(self, setup: LinkSetup, timeline: Timeline, lines: int) -> bool:
         """Judge the last `WINDOW_LINES`, and return whether the code has changed."""
@@ -47,7 +47,7 @@ class PoseDoubt(Struct):
         # A free-running board has no delay that matters: its lines are a period apart.
         vague = timeline.prompted.lateness.deviation > NARROW_DEVIATION and not setup.period_ns
         self.lines, self.gaps, self.coarse = lines, timeline.gaps, timeline.coarse.lines
-        self.due = lines + WINDOW_LINES
+        self.due_lines = lines + WINDOW_LINES
         before = self.code
         if coarse and (lossy or vague) and not setup.mcu.checked:
             self.code = "coarse_encoder"

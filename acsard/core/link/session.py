@@ -157,7 +157,7 @@ class McuSession(Struct):
                 self._judge(setup, out, now_ns)
         self.until_ns = until_ns
         if feedback and (
-            self.good_lines >= self.doubt.due or self._timeline.counts_check.differing
+            self.good_lines >= self.doubt.due_lines or self._timeline.counts_check.differing
         ):
             self._judge_doubt(setup)
         if self._rejected:

@@ -82,7 +82,7 @@ NOTHING: Motors = (0.0, 0.0, 0.0, 0.0)
 class Wheel(Struct):
     command: RadPerS = 0.0
     speed: RadPerS = 0.0  # smoothed
-    due: RadPerS = 0.0  # expected, and smoothed alike
+    expected: RadPerS = 0.0  # smoothed alike
     off: Rad = 0.0  # the sum of measured minus expected
     agrees: bool = True
     approaches: bool = False  # in the last block
@@ -243,19 +243,19 @@ class Wheels(Struct):
                 _rest(wheel, angle, block)
         else:
             left, right = self.sides
-            due_left = left.expect(commanded.front_left, s, lag)
-            due_right = right.expect(commanded.front_right, s, lag)
+            left_angle = left.expect(commanded.front_left, s, lag)
+            right_angle = right.expect(commanded.front_right, s, lag)
             if self.begins or self.late:
                 for side in self.sides:
                     speed = max(angles[side.front], angles[side.rear], key=abs) / s
                     side.expected = speed if self.begins else _nearer(side.expected, speed)
                 self.begins = False
             if not self.late:
-                self._obey(block, (due_left, due_right))
+                self._obey(block, (left_angle, right_angle))
                 self._miss(block.unit, patience)
         self._compare(block, kinematics)
 
-    def _obey(self, block: Block, due: tuple[Rad, Rad]) -> None:
+    def _obey(self, block: Block, expected: tuple[Rad, Rad]) -> None:
         s, angles, _, speeds, _, limit, patience, _ = block
         fastest = 0.0
         for i, wheel in enumerate(self.wheels):
@@ -268,7 +268,7 @@ class Wheels(Struct):
                 wheel.rested, wheel.rest_s, wheel.rest_angle = False, 0.0, 0.0
             elif not wheel.rested:
                 _rest(wheel, angle, block)
-            _follow(wheel, angle, due[k], block)
+            _follow(wheel, angle, expected[k], block)
             slack = ROUNDING * s + JITTER_S * abs(speeds[i])
             if speeds[i] == wheel.reported != 0.0 and abs(angle - speeds[i] * s) < slack:
                 wheel.same_s += s
@@ -277,7 +277,7 @@ class Wheels(Struct):
             if wheel.rested and abs(wheel.off) >= limit:
                 fastest, wheel.off = max(fastest, abs(wheel.speed)), 0.0
             if not wheel.rested:
-                self._pace(i, wheel, due[k], block)
+                self._pace(i, wheel, expected[k], block)
                 if not wheel.agrees and abs(wheel.off) >= limit and wheel.apart_s >= patience:
                     self._disobeys(i, wheel, angle, block.unit)
             if wheel.warning and wheel.agrees and not still and wheel.pace_s == 0.0:
@@ -289,7 +289,7 @@ class Wheels(Struct):
                 f"wheels turn at {fastest:.1f} rad/s without a command: is the robot being pushed?"
             )
 
-    def _pace(self, i: int, wheel: Wheel, due: Rad, block: Block) -> None:
+    def _pace(self, i: int, wheel: Wheel, expected: Rad, block: Block) -> None:
         s, angle, peak = block.s, block.angles[i], self.sides[SIDE_OF[i]].peak
         turns, most = abs(wheel.speed), TOO_FAST * peak
         rolled = wheel.fast_angle + angle
@@ -304,12 +304,12 @@ class Wheels(Struct):
             if wheel.fast_s >= TOO_FAST_S and beyond >= enough:
                 self._latch("wheel_too_fast", i, peak)
         # Quick or slow motors differ from what is expected after a change of the command.
-        steady = abs(wheel.due - wheel.command) < AGREEMENT * abs(wheel.command)
+        steady = abs(wheel.expected - wheel.command) < AGREEMENT * abs(wheel.command)
         if not wheel.agrees and steady:
             wheel.pace_s += s
-            wheel.pace_angle += angle - due
+            wheel.pace_angle += angle - expected
             if wheel.pace_s >= PACE_S and abs(wheel.pace_angle) >= block.unit:
-                fast = turns > abs(wheel.due)
+                fast = turns > abs(wheel.expected)
                 self._warn(i, wheel, wheel.warning or ("wheel_fast" if fast else "wheel_slow"))
         elif wheel.pace_s:
             wheel.pace_s -= s
@@ -338,13 +338,17 @@ class Wheels(Struct):
     def _are_swapped(self, i: int) -> bool:
         # Whether this wheel and the one across turn as commanded to each other.
         one, other = self.wheels[i], self.wheels[ACROSS[i]]
-        command, due = one.command - other.command, one.due - other.due
+        command, expected = one.command - other.command, one.expected - other.expected
         if abs(command) < SWAPPED_FRACTION * max(abs(one.command), abs(other.command)):
             return False
-        both = one.speed + other.speed - one.due - other.due
+        both = one.speed + other.speed - one.expected - other.expected
         turning = one.speed - other.speed
-        # Wheels that are quicker than expected turn as commanded, but not as is due.
-        if abs(both) > 0.75 * abs(due) or turning * due >= -due * due / 2 or turning * command >= 0:
+        # Wheels that are quicker than expected turn as commanded, but not as expected.
+        if (
+            abs(both) > 0.75 * abs(expected)
+            or turning * expected >= -expected * expected / 2
+            or turning * command >= 0
+        ):
             return False
         names = f"{WHEELS[i]} and {WHEELS[ACROSS[i]]}"
         figures = (
@@ -423,7 +427,7 @@ def count_angle(counts: int) -> Rad:
     return math.tau / (counts or ASSUMED_COUNTS)
 
 
-def _follow(wheel: Wheel, angle: Rad, due: Rad, block: Block) -> None:
+def _follow(wheel: Wheel, angle: Rad, expected_angle: Rad, block: Block) -> None:
     s, count, command, speed = block.s, block.unit, wheel.command, wheel.speed
     size = command if command > 0.0 else -command
     turns = speed if speed > 0.0 else -speed
@@ -433,17 +437,17 @@ def _follow(wheel: Wheel, angle: Rad, due: Rad, block: Block) -> None:
         smoothed = SMOOTHED_COUNTS * count / most
     share = 1.0 / (smoothed + s)
     speed = wheel.speed = speed + (angle - speed * s) * share
-    expected = wheel.due = wheel.due + (due - wheel.due * s) * share
+    expected = wheel.expected = wheel.expected + (expected_angle - wheel.expected * s) * share
     turns = speed if speed > 0.0 else -speed
     apart = abs(speed - expected)
-    off, most = wheel.off + angle - due, MOST * block.limit
+    off, most = wheel.off + angle - expected_angle, MOST * block.limit
     agrees = wheel.agrees = apart <= AGREEMENT * max(turns, abs(expected)) or apart < IDLE * count
     if agrees:
         off -= off * s / LEAK_S
         most = AGREED * block.limit
         wheel.missed = 0.0
     else:
-        wheel.missed += due - angle
+        wheel.missed += expected_angle - angle
     wheel.off = most if off > most else -most if off < -most else off
     away = speed - command
     nearer, farther = wheel.speed_then - speed, wheel.command_then - command
@@ -482,5 +486,5 @@ def _motors(values: list[float]) -> Motors:
 
 def _text(wheel: Wheel, i: int) -> str:
     assert wheel.warning is not None
-    share = wheel.speed / wheel.due if wheel.due else 0.0
+    share = wheel.speed / wheel.expected if wheel.expected else 0.0
     return joined(reason(wheel.warning, wheel=WHEELS[i], share=f"{share:.0%}")).text
