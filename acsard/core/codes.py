@@ -279,12 +279,12 @@ replies_damaged
     the microcontroller's replies arrive damaged:
     -> check cable and ground
 lines_too_rare
-    the microcontroller sends a line only every {apart} s, and no value of mcu.reply_period allows
-    that;
+    the microcontroller sends a line only every {interval} s, and no value of mcu.reply_period
+    allows that;
     -> firmware that reports by its own clock must send a line at least every {longest:g} s
 reply_period
-    the microcontroller's lines come {apart} s apart;
-    -> if it reports by its own clock, set mcu.reply_period = {apart}
+    the microcontroller's lines come {interval} s apart;
+    -> if it reports by its own clock, set mcu.reply_period = {interval}
 received_nothing
     no link to the microcontroller: {received};
     -> does the board have power, is mcu.port its port, is mcu.baud_rate right, are TX and RX

@@ -20,7 +20,7 @@ VALUES = {
     "direction": "backwards",
     "speed": 0.1, "by": "ann", "cause": "why", "places": "1 place", "dots": ".",
     "threshold": "21 V", "charged": "21.4 V", "wheel": "rear_left", "figures": "(1 rad/s)",
-    "trouble": "why", "received": "nothing", "apart": "0.20", "longest": 0.25,
+    "trouble": "why", "received": "nothing", "interval": "0.20", "longest": 0.25,
     "named": "rain", "wheels": "front_left and front_right", "share": "50 %",
 }  # fmt: skip
 """A value for each name in the texts."""

@@ -103,7 +103,9 @@ class Timeline(Struct):
             since = end_ns - before
             self.free_running.process_read(end_ns, since, lines, drained, setup.period_ns)
         elif not setup.mcu.checked:
-            self.prompted.process_read(out, end_ns, lines, setup.soonest_ns, setup.apart_ns)
+            self.prompted.process_read(
+                out, end_ns, lines, setup.soonest_ns, setup.command_interval_ns
+            )
 
     def skip_bad(self, setup: LinkSetup, out: Output) -> None:
         """Skip a line that is not used, and the command that it may answer, or its period."""
@@ -140,9 +142,11 @@ class Timeline(Struct):
             expected_ns, dt_ns, bridged_ns = self.free_running.place(self.rest, setup.period_ns)
         else:
             if asked_ns is not None and not self.rest:
-                self.prompted.measure(self.end_ns - asked_ns, self.read_lines, setup.apart_ns)
+                self.prompted.measure(
+                    self.end_ns - asked_ns, self.read_lines, setup.command_interval_ns
+                )
             expected_ns, dt_ns, bridged_ns = self.prompted.place(
-                out, self.end_ns, asked_ns, setup.apart_ns
+                out, self.end_ns, asked_ns, setup.command_interval_ns
             )
         dt, bridged, gap = dt_ns / NS_PER_S, bridged_ns / NS_PER_S, 0.0
         known, turned, doubt, self.restarted = self.begun, None, None, False
@@ -177,7 +181,7 @@ class Timeline(Struct):
                 if self.whole.covers_gap:
                     bridged = 0.0
             else:
-                self.whole.apart = 0.0
+                self.whole.carried = 0.0
         else:
             step = self.coarse.step(wheels, elapsed)
         expected_ns = expected_ns if expected_ns < came_ns else came_ns

@@ -239,7 +239,7 @@ def describe_state(setup: LinkSetup, link: LinkState, steps: StepTimes) -> Reaso
 
 
 def _sparse(sparse_s: float, longest_reply: float) -> Reason:
-    apart = f"{sparse_s:.2f}"
-    if float(apart) > longest_reply:
-        return sentence("lines_too_rare", apart=apart, longest=longest_reply)
-    return sentence("reply_period", apart=apart)
+    interval = f"{sparse_s:.2f}"
+    if float(interval) > longest_reply:
+        return sentence("lines_too_rare", interval=interval, longest=longest_reply)
+    return sentence("reply_period", interval=interval)

@@ -18,7 +18,7 @@ from acsard.core.values import NS_PER_S, Ns
 # Firmware counts for at least 4 ms, and repeats its last speeds in a reply before that. More
 # frequent replies must have its counts: if a board does not send them, a repeated speed looks like
 # a new one, and would count twice.
-LEAST_APART_NS = 9_000_000
+MIN_COMMAND_INTERVAL_NS = 9_000_000
 
 LATE_STEP_FRACTION = 0.5  # of `quiet_ns`, between two steps: the second is late
 
@@ -30,7 +30,7 @@ class LinkSetup(Struct, frozen=True):
     letters: bytes  # that end a checked command
     rest: bytes  # begin of every line with speed zero
     period_ns: Ns  # of a free-running board; 0: it answers commands
-    apart_ns: Ns  # between two commands
+    command_interval_ns: Ns  # between two commands
     soonest_ns: Ns  # a command and its reply on the wire
     quiet_ns: Ns  # silence after which the link is stale
     late_step_ns: float  # time between two steps that makes the second late
@@ -50,7 +50,7 @@ class LinkSetup(Struct, frozen=True):
     ) -> LinkSetup:
         codec, counts = Codec(mcu.wheels, mcu.trailing_comma), mcu.encoder_counts
         quiet_ns = int(NS_PER_S * max(0.1, 4 / rate_hz, 3 * mcu.reply_period))
-        apart_ns = round(NS_PER_S / rate_hz)
+        command_interval_ns = round(NS_PER_S / rate_hz)
         return cls(
             mcu,
             codec,
@@ -58,12 +58,12 @@ class LinkSetup(Struct, frozen=True):
             letters=SAMPLE_REQUEST if mcu.wants_samples else b"",
             rest=codec.stop.rstrip(b",\r\n"),
             period_ns=0 if mcu.checked else round(NS_PER_S * mcu.reply_period),
-            apart_ns=apart_ns,
+            command_interval_ns=command_interval_ns,
             soonest_ns=wire_ns(2 * PLAIN_BYTES, mcu.baud_rate),
             quiet_ns=quiet_ns,
             late_step_ns=LATE_STEP_FRACTION * quiet_ns,
             count=math.tau / counts if counts else 0.0,
-            shows_counts=mcu.reply_period > 0.0 or apart_ns >= LEAST_APART_NS,
+            shows_counts=mcu.reply_period > 0.0 or command_interval_ns >= MIN_COMMAND_INTERVAL_NS,
             fastest=feedback.wheel_speed / math.tau * counts / 1000,
             encoders=feedback.encoders,
             longest_reply=longest_reply,

@@ -45,8 +45,8 @@ class WholeCounts(Struct):
     speeds or times edges is detected.
     """
 
-    # s added to the next estimate, and in which the firmware last counted.
-    apart: float = 0.0
+    # s that the next estimate carries, and in which the firmware last counted.
+    carried: float = 0.0
     period: float = 0.0
     before: Motors = AT_REST
     doubt: float = 0.0  # share of the last lines that are no whole counts
@@ -66,12 +66,12 @@ class WholeCounts(Struct):
         fastest = max(a, b, c, d, -a, -b, -c, -d)
         if fastest <= ROUNDING:
             # The line does not show the firmware's time, so the host's time is the best available.
-            self.apart = 0.0
+            self.carried = 0.0
             return speeds if fastest == 0.0 else None
-        expected, self.covers_gap = elapsed + self.apart, False
+        expected, self.covers_gap = elapsed + self.carried, False
         repeated = speeds == before and expected < REPEATED_FRACTION * self.period
         if repeated and self.doubt < MAX_DOUBT:
-            self.apart = expected
+            self.carried = expected
             return AT_REST
         number, proved = _number(speeds, fastest, angle, expected)
         if gap:
@@ -86,16 +86,16 @@ class WholeCounts(Struct):
             # Only the other wheels can prove or refute whole counts.
             self.doubt += DOUBT_GAIN * ((not proved) - self.doubt)
         if self.doubt >= MAX_DOUBT:
-            self.apart = 0.0
+            self.carried = 0.0
             return None
         count = fastest / angle
         if not number or (proved is None and jitter * count > MAX_COUNT_ERROR):
-            self.apart, self.period = 0.0, expected
+            self.carried, self.period = 0.0, expected
             return a * expected, b * expected, c * expected, d * expected
         self.period = number / count
-        self.apart = CARRIED_ERROR * (expected - self.period)
+        self.carried = CARRIED_ERROR * (expected - self.period)
         if abs(expected - self.period) <= self.period * ROUNDING / fastest:
-            self.apart = 0.0  # the rounding of the speeds explains the difference
+            self.carried = 0.0  # the rounding of the speeds explains the difference
         count = self.period / angle
         return (
             round(a * count) * angle,

@@ -66,7 +66,7 @@ class Side(Struct):
     peak: RadPerS = 0.0  # of the commands in the last three response times, at least
     next_peak: RadPerS = 0.0
     peak_s: Seconds = 0.0  # since `peak` began
-    apart: Rad = 0.0  # recent sum of front minus rear
+    difference: Rad = 0.0  # recent sum of front minus rear
     rolled: Rad = 0.0  # recent sum of the magnitudes
     net: Rad = 0.0  # recent sum of the mean
     why: str = ""  # the sign of a faulty encoder that one wheel shows
@@ -101,10 +101,10 @@ class Side(Struct):
 
     def agrees(self, front: Rad, rear: Rad, keep: float, count: Rad) -> bool:
         """Add the angles of a block to the sums, and return whether they agree."""
-        self.apart = keep * (self.apart + front - rear)
+        self.difference = keep * (self.difference + front - rear)
         self.net = keep * (self.net + (front + rear) / 2)
         self.rolled = keep * (self.rolled + (abs(front) + abs(rear)) / 2)
-        return abs(self.apart) <= self._allowed(count)
+        return abs(self.difference) <= self._allowed(count)
 
     def judge(
         self, block: Block, agrees: bool, low: Rad, high: Rad, same_s: tuple[Seconds, Seconds]
@@ -145,7 +145,8 @@ class Side(Struct):
     def _slips(self, block: Block) -> bool:
         speed = (block.angles[self.front] + block.angles[self.rear]) / 2 / block.s
         mean = self.net / (PARTNER_S + PARTNER_S_PER_RAD * block.unit)
-        return abs(self.apart) > self._allowed(block.unit) + PARTNER_DELAY_S * abs(speed - mean)
+        slack = self._allowed(block.unit) + PARTNER_DELAY_S * abs(speed - mean)
+        return abs(self.difference) > slack
 
     def _agree(self, block: Block) -> Event | None:
         if self.out < 0:
@@ -184,21 +185,21 @@ class Side(Struct):
         self.of_rear += other
         self.low += low
         self.high += high
-        apart = abs(self.of_front - self.of_rear)
+        difference = abs(self.of_front - self.of_rear)
         off_front = max(self.low - self.of_front, self.of_front - self.high, 0.0)
         off_rear = max(self.low - self.of_rear, self.of_rear - self.high, 0.0)
         out = front if off_front > off_rear else rear
         if (
             self.votes < OUT_BLOCKS
-            or apart < OUT_COUNTS * block.unit + OUT_ANGLE
-            or abs(off_front - off_rear) < apart / 3
-            or min(off_front, off_rear) > apart / 2
+            or difference < OUT_COUNTS * block.unit + OUT_ANGLE
+            or abs(off_front - off_rear) < difference / 3
+            or min(off_front, off_rear) > difference / 2
             or self.suspect not in (-1, out)
             # An even wheel may be right, and the other one slip.
             or (
                 same_s[out == rear] < PROVEN_S
                 and self.why == "repeats"
-                and apart < AGREEMENT * max(abs(self.of_front), abs(self.of_rear))
+                and difference < AGREEMENT * max(abs(self.of_front), abs(self.of_rear))
             )
         ):
             return False

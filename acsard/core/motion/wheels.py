@@ -86,8 +86,8 @@ class Wheel(Struct):
     off: Rad = 0.0  # the sum of measured minus expected
     agrees: bool = True
     approaches: bool = False  # in the last block
-    apart_s: Seconds = 0.0  # since it came nearer to its command
-    apart_angle: Rad = 0.0  # that it rolled since then, beyond its command
+    away_s: Seconds = 0.0  # since it came nearer to its command
+    away_angle: Rad = 0.0  # that it rolled since then, beyond its command
     speed_then: RadPerS = 0.0  # when it did
     command_then: RadPerS = 0.0
     reacts: bool = False  # it came nearer since the command last moved away from it
@@ -118,7 +118,7 @@ class Wheels(Struct):
     by_gyro: bool = True  # it is known
     seconds: Seconds = 0.0
     lines: int = 0
-    apart: Rad = 0.0  # of front and rear in one block, beyond which it ends early
+    max_difference: Rad = 0.0  # of front and rear in one block, beyond which it ends early
     unreported_s: Seconds = REPEATED_S
     excludes: bool = False
     slips: bool = False  # the wheels of a side contradict each other
@@ -156,17 +156,14 @@ class Wheels(Struct):
         else:
             self.turn += turn
         self.events, self.fault, self.pushed, self.repair = (), None, "", NOTHING
-        apart = self.apart
+        most = self.max_difference
         if seconds < BLOCK_S and (
             self.lines == 1
-            or (
-                -apart < front_left - rear_left < apart
-                and -apart < front_right - rear_right < apart
-            )
+            or (-most < front_left - rear_left < most and -most < front_right - rear_right < most)
         ):
             return
         if feedback.encoders and seconds > 0.0:
-            self.apart = OUT_COUNTS * count + OUT_ANGLE
+            self.max_difference = OUT_COUNTS * count + OUT_ANGLE
             self._judge(turned, speeds.as_tuple(), feedback.response_time, kinematics, count)
         self._begin()
 
@@ -223,7 +220,7 @@ class Wheels(Struct):
         self.begins = True
         for wheel in self.wheels:
             wheel.off = wheel.fast_s = wheel.fast_angle = wheel.missed = 0.0
-            wheel.apart_s = wheel.apart_angle = 0.0
+            wheel.away_s = wheel.away_angle = 0.0
         for side in self.sides:
             side.peak = side.next_peak = 0.0
 
@@ -264,7 +261,7 @@ class Wheels(Struct):
             still = -COMMANDED < command < COMMANDED
             if not still:
                 if wheel.rested:
-                    wheel.off = wheel.missed = wheel.apart_s = wheel.apart_angle = 0.0
+                    wheel.off = wheel.missed = wheel.away_s = wheel.away_angle = 0.0
                 wheel.rested, wheel.rest_s, wheel.rest_angle = False, 0.0, 0.0
             elif not wheel.rested:
                 _rest(wheel, angle, block)
@@ -278,7 +275,7 @@ class Wheels(Struct):
                 fastest, wheel.off = max(fastest, abs(wheel.speed)), 0.0
             if not wheel.rested:
                 self._pace(i, wheel, expected[k], block)
-                if not wheel.agrees and abs(wheel.off) >= limit and wheel.apart_s >= patience:
+                if not wheel.agrees and abs(wheel.off) >= limit and wheel.away_s >= patience:
                     self._disobeys(i, wheel, angle, block.unit)
             if wheel.warning and wheel.agrees and not still and wheel.pace_s == 0.0:
                 self._warn(i, wheel, None)
@@ -321,7 +318,7 @@ class Wheels(Struct):
         if self._are_swapped(i):
             return
         goes_on = angle * off > 0.0 and speed * off > 0.0
-        beyond = abs(wheel.apart_angle)
+        beyond = abs(wheel.away_angle)
         if goes_on and abs(command) < COMMANDED:
             # A sound wheel comes to rest before it has rolled this far without an approach.
             if beyond >= max(FAULT_ANGLE, FAULT_COUNTS * count):
@@ -364,7 +361,7 @@ class Wheels(Struct):
             figures = f"(commanded {command:.2f}, measured {wheel.speed:.2f} rad/s)"
             self.fault = joined(reason(code, part=name, wheel=name, figures=figures))
         # Another fault needs new evidence: the robot stops now.
-        wheel.off = wheel.apart_s = wheel.apart_angle = wheel.fast_s = wheel.fast_angle = 0.0
+        wheel.off = wheel.away_s = wheel.away_angle = wheel.fast_s = wheel.fast_angle = 0.0
 
     def _warn(self, i: int, wheel: Wheel, code: Code | None) -> None:
         if code == wheel.warning:
@@ -384,7 +381,7 @@ class Wheels(Struct):
             still = -COMMANDED < side.command < COMMANDED
             if side.out >= 0 or still or min(abs(one.missed), abs(other.missed)) <= count:
                 continue
-            if one.apart_s >= patience and other.apart_s >= patience:
+            if one.away_s >= patience and other.away_s >= patience:
                 values = [0.0] * 4
                 values[side.front], values[side.rear] = one.missed, other.missed
                 one.missed = other.missed = 0.0
@@ -439,9 +436,11 @@ def _follow(wheel: Wheel, angle: Rad, expected_angle: Rad, block: Block) -> None
     speed = wheel.speed = speed + (angle - speed * s) * share
     expected = wheel.expected = wheel.expected + (expected_angle - wheel.expected * s) * share
     turns = speed if speed > 0.0 else -speed
-    apart = abs(speed - expected)
+    difference = abs(speed - expected)
     off, most = wheel.off + angle - expected_angle, MOST * block.limit
-    agrees = wheel.agrees = apart <= AGREEMENT * max(turns, abs(expected)) or apart < IDLE * count
+    agrees = wheel.agrees = (
+        difference <= AGREEMENT * max(turns, abs(expected)) or difference < IDLE * count
+    )
     if agrees:
         off -= off * s / LEAK_S
         most = AGREED * block.limit
@@ -455,13 +454,13 @@ def _follow(wheel: Wheel, angle: Rad, expected_angle: Rad, block: Block) -> None
         away, nearer, farther = -away, -nearer, -farther
     approaches = wheel.approaches = nearer > APPROACH * away + 2 * count * share
     if away <= AGREEMENT * max(turns, size) or farther > AGREEMENT * away:
-        wheel.apart_s, wheel.apart_angle = 0.0, 0.0
+        wheel.away_s, wheel.away_angle = 0.0, 0.0
         wheel.speed_then, wheel.command_then, wheel.reacts = speed, command, False
     elif approaches:
-        wheel.apart_s, wheel.apart_angle, wheel.speed_then, wheel.reacts = 0.0, 0.0, speed, True
+        wheel.away_s, wheel.away_angle, wheel.speed_then, wheel.reacts = 0.0, 0.0, speed, True
     else:
-        wheel.apart_s += s
-        wheel.apart_angle += angle - command * s
+        wheel.away_s += s
+        wheel.away_angle += angle - command * s
         if nearer < 0.0 and not wheel.reacts:
             wheel.speed_then = speed  # the worst one counts
 
