@@ -409,7 +409,7 @@ class Robot:
             Event("lines_rejected", why, "warning", kind="implausible", count=1, news=False)
         )
         state.odometry.skipped.add(line)
-        if state.sanity.doubtful:
+        if state.sanity.failed:
             cause = why if self.config.mcu.encoder_counts else f"{why}; {UNDECLARED}"
             self._fault(reason("impossible_speeds", cause=cause), now, events)
         return False

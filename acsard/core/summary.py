@@ -50,7 +50,7 @@ def summary(robot: Robot, now_ns: Ns) -> Snapshot:
             gyro=gyro.does,
             encoder_counts=list(session.encoder_counts(robot.link_setup)),
             wheel_fault=wheels.text,
-            pose_doubt=session.doubt.code,
+            pose_doubt=session.pose_warning.code,
             sender=state.choice.sender,
             causes=[
                 _cause(cause, state.life.shown.get(cause.number), now_ns)

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from acsard.core.link.coarse_encoders import CoarseEncoders
 from acsard.core.link.codec import Motors
-from acsard.core.link.whole_counts import MAX_DOUBT
+from acsard.core.link.whole_counts import MAX_MISFIT
 from acsard.core.link.whole_counts import WholeCounts as Recovered
 from tests.each import each
 
@@ -128,7 +128,7 @@ class WholeCounts:
 
     @property
     def believed(self) -> bool:
-        return self._whole.doubt < MAX_DOUBT
+        return self._whole.misfit < MAX_MISFIT
 
 
 @each("counts", [16, 20, 96])

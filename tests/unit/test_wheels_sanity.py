@@ -121,7 +121,7 @@ def verdicts(sanity: Sanity, some: list[Line], fastest: float = 80.0) -> str:
     found = ""
     for each_line in some:
         why = sanity.impossible(each_line, fastest)
-        found += "F" if sanity.doubtful else "x" if why else "."
+        found += "F" if sanity.failed else "x" if why else "."
     return found
 
 
@@ -145,7 +145,7 @@ def test_forgetting_starts_over_but_the_last_line_is_still_compared() -> None:
     sanity = Sanity()
     verdicts(sanity, lines(0, 99, 99, 99))
     sanity.forget()
-    assert not sanity.doubtful
+    assert not sanity.failed
     assert verdicts(sanity, lines(79, 0)) == "x."
     sanity, fast = Sanity(), [ten(95, step=31.4)] * 2
     assert verdicts(sanity, fast) == ".."

@@ -6,8 +6,8 @@ used only if the counts cannot have wrapped and a wheel at its highest speed can
 the caller uses speed times time. The module also detects a probable restart of the board.
 
 The firmware computes counts and speeds from the same edges, so they differ only if
-`mcu.encoder_counts` is wrong. Then the pose uses the speeds, and the difference until then is a
-doubt.
+`mcu.encoder_counts` is wrong. Then the pose uses the speeds, and the difference until then becomes
+a doubt, which the covariance contains.
 """
 
 from __future__ import annotations

@@ -24,9 +24,9 @@ from acsard.core.link.link_setup import LinkSetup
 from acsard.core.link.link_state import GOOD_LINES, WATCHDOG_NS, WATCHDOG_S, Link
 from acsard.core.link.link_state import State as LinkState
 from acsard.core.link.output import QUESTION_LINE, Output
-from acsard.core.link.pose_doubt import PoseDoubt
+from acsard.core.link.pose_warning import PoseWarning
 from acsard.core.link.step_times import StepTimes
-from acsard.core.link.whole_counts import MAX_DOUBT
+from acsard.core.link.whole_counts import MAX_MISFIT
 from acsard.core.values import (
     NS_PER_S,
     STILL,
@@ -78,7 +78,7 @@ class McuSession(Struct):
     rejects: dict[str, int] = {}  # by reason
     steps: StepTimes = field(default_factory=StepTimes)
     status: StatusReports = field(default_factory=StatusReports)
-    doubt: PoseDoubt = field(default_factory=PoseDoubt)
+    pose_warning: PoseWarning = field(default_factory=PoseWarning)
     _lines: LineReader = field(default_factory=LineReader)
     _echo: EchoCheck = field(default_factory=EchoCheck)
     _link: Link = field(default_factory=Link)
@@ -157,9 +157,9 @@ class McuSession(Struct):
                 self._judge(setup, out, now_ns)
         self.until_ns = until_ns
         if feedback and (
-            self.good_lines >= self.doubt.due_lines or self._timeline.counts_check.differing
+            self.good_lines >= self.pose_warning.due_lines or self._timeline.counts_check.differing
         ):
-            self._judge_doubt(setup)
+            self._warn_of_pose(setup)
         if self._rejected:
             self._announce_rejects()
         if now_ns >= until_ns and (link.state, self._trouble, self.blocked) != self._announced:
@@ -222,7 +222,7 @@ class McuSession(Struct):
 
     def encoder_counts(self, setup: LinkSetup) -> tuple[int, ...]:
         """Return the declared counts per turn of each wheel; 0 if the speeds contradict them."""
-        agree = self._timeline.whole.doubt < MAX_DOUBT
+        agree = self._timeline.whole.misfit < MAX_MISFIT
         return (setup.mcu.encoder_counts if agree else 0,) * 4
 
     def asks(self, at_ns: Ns) -> None:
@@ -307,10 +307,10 @@ class McuSession(Struct):
             )
         self._rejected.clear()
 
-    def _judge_doubt(self, setup: LinkSetup) -> None:
-        changed = self.doubt.judge(setup, self._timeline, self.good_lines)
-        if changed and self.doubt.code:
-            why = sentence(self.doubt.code)
+    def _warn_of_pose(self, setup: LinkSetup) -> None:
+        changed = self.pose_warning.choose_code(setup, self._timeline, self.good_lines)
+        if changed and self.pose_warning.code:
+            why = sentence(self.pose_warning.code)
             self.events.append(Event("pose_doubtful", why.text, "warning", code=why.code))
 
     def _announce(self, setup: LinkSetup) -> None:

@@ -31,8 +31,8 @@ CARRIED_ERROR = 0.95
 # counts yet and repeats its speeds.
 REPEATED_FRACTION = 0.55
 
-# Gain of `doubt`. Once it reaches the share, no line counts as whole counts.
-DOUBT_GAIN, MAX_DOUBT = 0.1, 0.3
+# Gain of `misfit`. Once it reaches the share, no line counts as whole counts.
+MISFIT_GAIN, MAX_MISFIT = 0.1, 0.3
 
 AT_REST: Motors = (0.0, 0.0, 0.0, 0.0)
 
@@ -49,7 +49,7 @@ class WholeCounts(Struct):
     carried: float = 0.0
     period: float = 0.0
     before: Motors = AT_REST
-    doubt: float = 0.0  # share of the last lines that are no whole counts
+    misfit: float = 0.0  # share of the last lines that are no whole counts
     covers_gap: bool = False  # the last line includes the counts of the missing line before it
 
     def turned(
@@ -70,7 +70,7 @@ class WholeCounts(Struct):
             return speeds if fastest == 0.0 else None
         expected, self.covers_gap = elapsed + self.carried, False
         repeated = speeds == before and expected < REPEATED_FRACTION * self.period
-        if repeated and self.doubt < MAX_DOUBT:
+        if repeated and self.misfit < MAX_MISFIT:
             self.carried = expected
             return AT_REST
         number, proved = _number(speeds, fastest, angle, expected)
@@ -84,8 +84,8 @@ class WholeCounts(Struct):
                 number, proved, expected = longer, sure, expected + gap
         if proved is not None:
             # Only the other wheels can prove or refute whole counts.
-            self.doubt += DOUBT_GAIN * ((not proved) - self.doubt)
-        if self.doubt >= MAX_DOUBT:
+            self.misfit += MISFIT_GAIN * ((not proved) - self.misfit)
+        if self.misfit >= MAX_MISFIT:
             self.carried = 0.0
             return None
         count = fastest / angle

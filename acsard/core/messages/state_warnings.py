@@ -94,5 +94,5 @@ def _warnings(state: RobotState) -> Iterator[StateWarning]:
         yield StateWarning("latch_file", "latch file fails", state.latch_file_error)
     if state.wheel_fault:
         yield StateWarning("wheel", "wheel fault", state.wheel_fault)
-    if doubt := CODES.get(state.pose_doubt):
-        yield StateWarning("pose", "pose doubtful", f"{doubt.text} {doubt.advice}")
+    if warning := CODES.get(state.pose_doubt):
+        yield StateWarning("pose", "pose doubtful", f"{warning.text} {warning.advice}")

@@ -90,7 +90,7 @@ class Clock(Struct):
     used_ns: Ns = 0  # arrival of the last accepted command
     low: int = 0  # lowest delay of a proof
     since_ns: Ns | None = None  # a proof runs, in which the delay has not fallen since then
-    doubt: tuple[Ns, Ns] | None = None  # arrival and stamp of the first refused command
+    first_refused: tuple[Ns, Ns] | None = None  # arrival and stamp of the first refused command
     cause: Verdict = ""  # of refusals that last
     advance: float = 0.0  # of the stamps, s per second, while refusals last
     behind: int = 0  # delay above the least one
@@ -111,7 +111,7 @@ class Clock(Struct):
             verdict = "not_newer"
         if verdict:
             return self._lasting(verdict, at_ns, stamp_ns)
-        self.accepted_ns, self.used_ns, self.doubt, self.cause = stamp_ns, at_ns, None, ""
+        self.accepted_ns, self.used_ns, self.first_refused, self.cause = stamp_ns, at_ns, None, ""
         self.least = delay if self.least is None else min(self.least, delay)
         if not self.lows or at_ns - self.slot_ns >= SLOT_NS:
             self.lows, self.slot_ns = [*self.lows[-(MEMORY_NS // SLOT_NS) :], self.least], at_ns
@@ -147,11 +147,11 @@ class Clock(Struct):
 
     def _lasting(self, verdict: Verdict, at_ns: Ns, stamp_ns: Ns) -> Verdict:
         # Name the cause of refusals that go on: it is looked for again every `LASTING_NS`.
-        if self.doubt is None:
-            self.doubt = at_ns, stamp_ns
-        elif (lasted_ns := at_ns - self.doubt[0]) >= LASTING_NS:
-            self.advance = (stamp_ns - self.doubt[1]) / lasted_ns
-            self.doubt = at_ns, stamp_ns
+        if self.first_refused is None:
+            self.first_refused = at_ns, stamp_ns
+        elif (lasted_ns := at_ns - self.first_refused[0]) >= LASTING_NS:
+            self.advance = (stamp_ns - self.first_refused[1]) / lasted_ns
+            self.first_refused = at_ns, stamp_ns
             if not SLOWEST <= self.advance <= FASTEST:
                 self.cause = "stamps"
             else:

@@ -64,7 +64,7 @@ class Sanity(Struct):
         self.trusted, self.count, self.beyond = False, 0, NOT_FAST
 
     @property
-    def doubtful(self) -> bool:
+    def failed(self) -> bool:
         """Whether the last `FAULT_LINES` lines were impossible, which latches a fault."""
         return self.count >= FAULT_LINES
 
@@ -72,7 +72,7 @@ class Sanity(Struct):
         """Return why no wheel can have these speeds, or ""; `fastest` is `feedback.wheel_speed`.
 
         The allowed change grows with the time since the last possible line, so a real jump is
-        accepted in time. Updates `doubtful` and `warning`.
+        accepted in time. Updates `failed` and `warning`.
         """
         dt, since = feedback.dt, feedback.since
         since = dt if dt > since else since

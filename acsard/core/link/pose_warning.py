@@ -25,7 +25,7 @@ MAX_LOST_FRACTION = 0.01
 MIN_COARSE_LINES = 50  # of a window, if the counts per turn are not declared
 
 
-class PoseDoubt(Struct):
+class PoseWarning(Struct):
     code: PoseCode | Literal[""] = ""
     # Good lines, lines behind lost ones, and lines of coarse encoders, at the last comparison.
     lines: int = 0
@@ -33,8 +33,8 @@ class PoseDoubt(Struct):
     coarse: int = 0
     due_lines: int = WINDOW_LINES  # good lines at the next comparison
 
-    def judge(self, setup: LinkSetup, timeline: Timeline, lines: int) -> bool:
-        """Judge the last `WINDOW_LINES`, and return whether the code has changed."""
+    def choose_code(self, setup: LinkSetup, timeline: Timeline, lines: int) -> bool:
+        """Choose the code by the last `WINDOW_LINES`, and return whether it has changed."""
         if timeline.counts_check.wrong:
             before, self.code = self.code, "encoder_counts_wrong"
             return before != self.code
