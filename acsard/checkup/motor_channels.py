@@ -235,7 +235,7 @@ def run_up(board: Board, motors: Motors) -> Motors:
         replies = [reply.motors for reply in board.drive(command, board.period_s)]
         board.repeats.record(replies, before, command)
         before = command
-    board.repeats.judge()
+    board.repeats.check()
     began_s, look_s = board.now_s, _look_s(board)
     driven = [motor for motor in range(4) if motors[motor]]
     means, looks, steady = ZERO, 0, 0

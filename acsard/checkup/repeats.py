@@ -35,7 +35,7 @@ class Repeats(Struct):
         self.moving += len(moving)
         self.repeated += sum(reply in (before, command) for reply in moving)
 
-    def judge(self) -> None:
+    def check(self) -> None:
         """Raise `StoppedError` if the daemon would not drive with such replies."""
         others = self.replies - self.repeated
         if self.repeated < MIN_REPEATED:

@@ -86,7 +86,7 @@ def play(network: Network, echoes: bool, dice: random.Random) -> Outcome:
             echo=Echo(RUN, _ns(beat)) if echoes else None,
             age_ns=_ns(arrived) - _ns(beat) if echoes else None,
         )
-        verdict = ages.judge(command, order, TIMEOUT_NS, stalled=False)
+        verdict = ages.judge_age(command, order, TIMEOUT_NS, stalled=False)
         verdicts.add(verdict)
         age = arrived - sent
         if not verdict:
@@ -185,7 +185,7 @@ class Sender:
         at_ns = int(at_ms * MS) + 1000 * NS_PER_S
         stamp_ns = None if stamp_ms is None else int(stamp_ms * MS) + 1000 * NS_PER_S
         command = Command("app", SPEED, at_ns, stamp_ns, clock, "a", sequence=self.number)
-        return self.ages.judge(command, self.order, TIMEOUT_NS, stalled=False)
+        return self.ages.judge_age(command, self.order, TIMEOUT_NS, stalled=False)
 
 
 def test_a_new_clock_counts_when_its_least_delay_has_not_fallen_for_one_timeout() -> None:
@@ -272,7 +272,7 @@ def echo(age_ms: float | None, number: int = 1, beat_ms: int = 100) -> Command:
     [(0, ""), (300, ""), (301, "too_old"), (-1, "from_future"), (None, "other_run")],
 )
 def test_the_age_of_an_echo_is_judged_without_its_stamp(age_ms: float | None, verdict: str) -> None:
-    assert Ages().judge(echo(age_ms), Order(), TIMEOUT_NS, stalled=True) == verdict
+    assert Ages().judge_age(echo(age_ms), Order(), TIMEOUT_NS, stalled=True) == verdict
 
 
 @each(
@@ -286,7 +286,7 @@ def test_echoes_are_ordered_by_the_beat_and_then_by_the_number_and_must_go_on(
     number: int, beat_ms: int, verdict: str
 ) -> None:
     ages, order = Ages(), Order()
-    assert ages.judge(echo(0, 5), order, TIMEOUT_NS, stalled=False) == ""
-    assert ages.judge(echo(0, number, beat_ms), order, TIMEOUT_NS, stalled=False) == verdict
+    assert ages.judge_age(echo(0, 5), order, TIMEOUT_NS, stalled=False) == ""
+    assert ages.judge_age(echo(0, number, beat_ms), order, TIMEOUT_NS, stalled=False) == verdict
     plain = Command("app", SPEED, 1001 * NS_PER_S, 7, "a", "a", sequence=9)
-    assert ages.judge(plain, order, TIMEOUT_NS, stalled=False) == "no_echo"
+    assert ages.judge_age(plain, order, TIMEOUT_NS, stalled=False) == "no_echo"

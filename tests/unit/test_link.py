@@ -125,7 +125,7 @@ def test_lines_further_apart_than_the_silence_limit_make_no_link() -> None:
     link.apply("opened")
     for number in range(12):
         link.good(number * 101 * MS, 100 * MS)
-        link.judge(number * 101 * MS, True, False)
+        link.decide_state(number * 101 * MS, True, False)
         assert link.state == "booting"
         sparse.append(link.sparse_s)
     assert (sparse[1], sparse[-1]) == (0.0, 0.101)  # a single one proves nothing

@@ -98,14 +98,14 @@ def test_it_comes_after_three_seconds_and_again_only_when_it_changes() -> None:
     for tick in range(100):
         if tick > 50:
             hearing.now.take(b"\x00")
-        if hearing.judge(tick * FIRST_DIAGNOSIS_NS // 10):
+        if hearing.diagnose(tick * FIRST_DIAGNOSIS_NS // 10):
             assert hearing.heard is not None
             reports.append((tick, hearing.heard.code))
     assert reports == [(10, "received_nothing"), (60, "received_garbage")]
     hearing.now.line(STOP, good=True)
     hearing.forget()
     assert (hearing.heard, hearing.now) == (None, Heard())
-    assert not hearing.judge(10 * FIRST_DIAGNOSIS_NS)
+    assert not hearing.diagnose(10 * FIRST_DIAGNOSIS_NS)
 
 
 @each(
@@ -139,11 +139,11 @@ def after(*steps_ms: int, good: bool = False) -> StepTimes:
     `good` says whether another good line arrives in the last step.
     """
     steps, now_ns = StepTimes(0), 0
-    steps.judge_lines(REAL, good=True)
+    steps.excuses_silence(REAL, good=True)
     for number, step_ms in enumerate(steps_ms, 1):
         now_ns += step_ms * MS
         steps.begin(now_ns)
-        steps.judge_lines(REAL, good=good and number == len(steps_ms))
+        steps.excuses_silence(REAL, good=good and number == len(steps_ms))
     return steps
 
 

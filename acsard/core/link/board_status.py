@@ -70,10 +70,10 @@ class StatusReports(Struct):
     last_ns: Ns | None = None  # arrival of the last line
     forgot: bool = False  # in the last update
     # Both of these since the last opening, and how long the link was up: None after the fields of
-    # another board were forgotten, and then `judge` has nothing to do.
+    # another board were forgotten, and then `forget_other_board` has nothing to do.
     since_opening: tuple[BoardStatus, Ns | None] = (BoardStatus(), None)
     up_ns: Ns | None = 0
-    judged_ns: Ns = 0
+    checked_ns: Ns = 0
 
     def begin_update(self) -> None:
         self.forgot = False
@@ -90,13 +90,13 @@ class StatusReports(Struct):
         self.since_opening = merged(self.since_opening[0], status), at_ns
         self.new.append((at_ns, status))
 
-    def judge(self, now_ns: Ns, up: bool, late: bool) -> None:
+    def forget_other_board(self, now_ns: Ns, up: bool, late: bool) -> None:
         """Forget the fields of another board, if the link was up long enough without late steps.
 
         Call it while `up_ns` is known.
         """
         assert self.up_ns is not None
-        passed_ns, self.judged_ns = now_ns - self.judged_ns, now_ns
+        passed_ns, self.checked_ns = now_ns - self.checked_ns, now_ns
         self.up_ns = 0 if not up else self.up_ns + (0 if late else passed_ns)
         if self.up_ns >= FORGET_NS:
             self.up_ns, self.forgot = None, True

@@ -159,7 +159,7 @@ class SilenceDiagnosis(Struct):
         """Discard the diagnosis: the link is up, the output blocked, or the port changed."""
         self.heard, self.now, self.since_ns = None, Heard(), None
 
-    def judge(self, now_ns: Ns, late_s: float = 0.0) -> bool:
+    def diagnose(self, now_ns: Ns, late_s: float = 0.0) -> bool:
         """Process a step without a link, and return whether the diagnosis is of a new class."""
         if self.since_ns is None:
             self.since_ns = now_ns

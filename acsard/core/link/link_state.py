@@ -134,7 +134,7 @@ class Link(Struct):
         """Whether at least the last `BAD_LINES` lines were bad."""
         return self.bad_in_row >= BAD_LINES
 
-    def judge(self, now_ns: Ns, may_rise: bool, checked: bool) -> None:
+    def decide_state(self, now_ns: Ns, may_rise: bool, checked: bool) -> None:
         """Change the state to "stale" after a silence, or, if it may rise, to "up"."""
         silent = self.silent(now_ns)
         if self.state == "up":

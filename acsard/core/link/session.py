@@ -134,7 +134,7 @@ class McuSession(Struct):
                     self._reject("too_long", more=more)
                     link.bad(setup.checked)
             steps = self.steps
-            if steps.judge_lines(setup, good=bool(feedback)):
+            if steps.excuses_silence(setup, good=bool(feedback)):
                 link.reset_silences()
             if (
                 steps.step_s
@@ -154,7 +154,7 @@ class McuSession(Struct):
             ):
                 until_ns = min(link.silent_ns + 1, echo.since_ns + WINDOW_NS)
             if now_ns >= until_ns:
-                self._judge(setup, out, now_ns)
+                self._decide_link(setup, out, now_ns)
         self.until_ns = until_ns
         if feedback and (
             self.good_lines >= self.pose_warning.due_lines or self._timeline.counts_check.differing
@@ -263,7 +263,7 @@ class McuSession(Struct):
         out.restart()
         self._echo.restart()
 
-    def _judge(self, setup: LinkSetup, out: Output, now_ns: Ns) -> None:
+    def _decide_link(self, setup: LinkSetup, out: Output, now_ns: Ns) -> None:
         link, since_ns = self._link, out.blocked_since
         if since_ns is None:
             self.blocked = False
@@ -280,14 +280,14 @@ class McuSession(Struct):
             link.apply("repeated")
         held = self._starting_over or not echo.asked or echo.trouble
         if link.state != "up" or now_ns > link.silent_ns:
-            link.judge(now_ns, may_rise=not held, checked=setup.checked)
+            link.decide_state(now_ns, may_rise=not held, checked=setup.checked)
         self.link, up = link.state, link.state == "up"
         if self.status.up_ns is not None:  # else nothing is to be forgotten
-            self.status.judge(now_ns, up, late=self.steps.step_s > 0.0)
+            self.status.forget_other_board(now_ns, up, late=self.steps.step_s > 0.0)
         if up or self.blocked:
             if self.blocked or not was_up:  # the diagnosis of a link that stays up is empty
                 self._hearing.forget()
-        elif self._hearing.judge(now_ns, self.steps.step_s):
+        elif self._hearing.diagnose(now_ns, self.steps.step_s):
             # The board may answer only plain lines, such as the first one after the opening.
             self._unchecked = self._unchecked or self._plain_lines > 0
             why = self.describe_link(setup)

@@ -41,7 +41,7 @@ class StepTimes(Struct):
     def is_late(self) -> bool:
         return self.passed_ns > LATE_NS
 
-    def judge_lines(self, setup: LinkSetup, good: bool) -> bool:
+    def excuses_silence(self, setup: LinkSetup, good: bool) -> bool:
         """Return whether this step ends a silence of the board that this computer caused.
 
         Only a good line ends one. The built-in simulator runs on this computer, so with it the

@@ -95,7 +95,7 @@ class Clock(Struct):
     advance: float = 0.0  # of the stamps, s per second, while refusals last
     behind: int = 0  # delay above the least one
 
-    def judge(self, at_ns: Ns, stamp_ns: Ns, timeout_ns: Ns) -> Verdict:
+    def judge_stamp(self, at_ns: Ns, stamp_ns: Ns, timeout_ns: Ns) -> Verdict:
         still = self._stands_still(at_ns, stamp_ns, timeout_ns)
         delay, least = at_ns - stamp_ns, self._risen(at_ns, timeout_ns)
         self.at_ns, self.stamp_ns, self.least = at_ns, stamp_ns, least
@@ -164,7 +164,7 @@ class Ages(Struct):
 
     clocks: dict[str, Clock] = {}
 
-    def judge(self, command: Command, last: Order, timeout_ns: Ns, stalled: bool) -> Verdict:
+    def judge_age(self, command: Command, last: Order, timeout_ns: Ns, stalled: bool) -> Verdict:
         """Return "" if the command is young enough and newer than the last accepted one.
 
         `stalled`: the daemon stood still just now, so a command without a stamp may be old.
@@ -173,7 +173,7 @@ class Ages(Struct):
             verdict = last.judge_echo(command, timeout_ns)
         elif command.stamp_ns is not None:
             clock = self._clock(command.clock, command.arrived_ns, command.stamp_ns)
-            verdict = clock.judge(command.arrived_ns, command.stamp_ns, timeout_ns)
+            verdict = clock.judge_stamp(command.arrived_ns, command.stamp_ns, timeout_ns)
             if not verdict and last.overtook(command, timeout_ns):
                 verdict = "not_newer"
         elif stalled:

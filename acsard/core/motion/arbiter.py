@@ -145,7 +145,7 @@ class Arbiter(Struct):
                 if other.shared:
                     other.cancel_zero(now_ns)
         stalled = not zero and now_ns < self.caught_up_ns
-        verdict = source.ages.judge(command, sender.order, timeout, stalled)
+        verdict = source.ages.judge_age(command, sender.order, timeout, stalled)
         if verdict:
             if neutral and verdict in ("unproven", "early"):
                 _keep_hint(sender, command, timeout)

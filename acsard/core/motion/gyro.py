@@ -320,7 +320,7 @@ class Gyro(Struct):
             if block is not None:
                 self._compare(block, claims, known)
         agreement.disagrees_s = max(0.0, agreement.disagrees_s - dt)
-        self._judge(silent, known)
+        self._decide_use(silent, known)
         if self.does not in ("used", "disagrees"):
             return self._wheels(dt, wheels, claims)
         if not self.used and dt > 0.0:
@@ -380,7 +380,7 @@ class Gyro(Struct):
         self.learn_again |= contradiction
         self.doubt += doubt
 
-    def _judge(self, silent: bool, known: bool) -> None:
+    def _decide_use(self, silent: bool, known: bool) -> None:
         verdict = self.agreement.verdict
         if verdict != "none yet" and verdict != "good":
             self.does = verdict

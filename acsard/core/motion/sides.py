@@ -106,10 +106,10 @@ class Side(Struct):
         self.rolled = keep * (self.rolled + (abs(front) + abs(rear)) / 2)
         return abs(self.difference) <= self._allowed(count)
 
-    def judge(
+    def find_fault(
         self, block: Block, agrees: bool, low: Rad, high: Rad, same_s: tuple[Seconds, Seconds]
     ) -> Event | None:
-        """Judge a block, and return an event if a wheel is left out or used again, or slips.
+        """Return an event if a block excludes a wheel, uses it again, or shows a slip.
 
         A healthy wheel rolled from `low` to `high`. The wheels repeat one speed for `same_s`.
         """

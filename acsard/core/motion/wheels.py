@@ -164,7 +164,7 @@ class Wheels(Struct):
             return
         if feedback.encoders and seconds > 0.0:
             self.max_difference = OUT_COUNTS * count + OUT_ANGLE
-            self._judge(turned, speeds.as_tuple(), feedback.response_time, kinematics, count)
+            self._end_block(turned, speeds.as_tuple(), feedback.response_time, kinematics, count)
         self._begin()
 
     def pause(self) -> None:
@@ -224,7 +224,7 @@ class Wheels(Struct):
         for side in self.sides:
             side.peak = side.next_peak = 0.0
 
-    def _judge(
+    def _end_block(
         self, line: Motors, speeds: Motors, lag: Seconds, kinematics: Kinematics, count: Rad
     ) -> None:
         s, angles, commanded = self.seconds, self.angles, self.commanded
@@ -403,7 +403,7 @@ class Wheels(Struct):
             if self.by_gyro and agree[1 - k]:
                 low = high = kinematics.opposite(*means, self.turn)[k]
             same_s = self.wheels[side.front].same_s, self.wheels[side.rear].same_s
-            before, event = side.out, side.judge(block, agree[k], low, high, same_s)
+            before, event = side.out, side.find_fault(block, agree[k], low, high, same_s)
             if before < 0 <= side.out:
                 repair = list(self.repair)
                 repair[side.out] = side.repair
