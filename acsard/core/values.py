@@ -29,6 +29,8 @@ Rad = float
 RadPerS = float
 Metres = float
 
+Wheels4 = tuple[float, float, float, float]  # a value of each wheel, in `WHEELS` order
+
 NS_PER_S = 1_000_000_000
 NS_PER_US = 1000
 
@@ -84,8 +86,7 @@ class WheelSpeeds(Struct, frozen=True, gc=False):
     rear_left: float = 0.0
     rear_right: float = 0.0
 
-    def as_tuple(self) -> tuple[float, float, float, float]:
-        """Return the four speeds in `WHEELS` order."""
+    def as_tuple(self) -> Wheels4:
         return self.front_right, self.front_left, self.rear_left, self.rear_right
 
 
@@ -257,8 +258,7 @@ class Estimate(Struct, frozen=True, gc=False):
     twist: Twist
     covariance: PoseCovariance
     twist_variances: TwistVariances
-    # rad since the daemon started, beyond a full turn, in `WHEELS` order.
-    positions: tuple[float, float, float, float]
+    positions: Wheels4  # rad since the daemon started, beyond a full turn
     speeds: WheelSpeeds
     asked_ns: Ns | None = None  # when the line was written that this one answers, if known
     heard_ns: Ns = 0  # the complete line was received

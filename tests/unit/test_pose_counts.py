@@ -12,9 +12,9 @@ import pytest
 from numpy.typing import NDArray
 
 from acsard.core.link.coarse_encoders import CoarseEncoders
-from acsard.core.link.codec import Motors
 from acsard.core.link.whole_counts import MAX_MISFIT
 from acsard.core.link.whole_counts import WholeCounts as Recovered
+from acsard.core.values import Wheels4
 from tests.each import each
 
 Array = NDArray[np.float64]
@@ -48,7 +48,7 @@ def angles(seed: int, seconds: float, jitter: float) -> tuple[Array, Array]:
 
 def lines(
     counts: int, jitter: float = 0.0, nominal: bool = False
-) -> Iterator[tuple[Motors, list[float]]]:
+) -> Iterator[tuple[Wheels4, list[float]]]:
     """Yield the speeds of each line and the true counts. The host takes each line for 10 ms.
 
     The firmware divides by the true time between two samples, or by the `nominal` period.
@@ -62,7 +62,7 @@ def lines(
         yield (a, b, c, d), number
 
 
-def found(encoders: CoarseEncoders, some: Iterable[Motors], elapsed: float = PERIOD) -> str:
+def found(encoders: CoarseEncoders, some: Iterable[Wheels4], elapsed: float = PERIOD) -> str:
     for speeds in some:
         encoders.step(speeds, elapsed)
     return encoders.found
@@ -90,7 +90,7 @@ def test_fine_encoders_are_not_although_the_board_counts_for_less_than_a_line(
     assert (encoders.found, encoders.lines) == ("fine", 0)
 
 
-def fine(count: int) -> list[Motors]:
+def fine(count: int) -> list[Wheels4]:
     dice, rows = random.Random(1), []
     for i in range(count):
         a, b, c, d = [round(10 + dice.uniform(-0.2, 0.2) + 0.02 * i, 2) for _ in range(4)]
@@ -123,7 +123,7 @@ class WholeCounts:
     def __init__(self, counts: int) -> None:
         self.angle, self._whole = math.tau / counts, Recovered()
 
-    def turned(self, speeds: Motors, elapsed: float = PERIOD) -> Motors | None:
+    def turned(self, speeds: Wheels4, elapsed: float = PERIOD) -> Wheels4 | None:
         return self._whole.turned(self.angle, speeds, elapsed, 0.0005)
 
     @property

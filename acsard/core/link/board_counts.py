@@ -21,7 +21,7 @@ from acsard.core.link.checked_line import Reading
 from acsard.core.link.codec import Motors
 from acsard.core.link.line_times import MAX_CLOCK_ERROR
 from acsard.core.link.link_setup import LinkSetup
-from acsard.core.values import Ns
+from acsard.core.values import Ns, Wheels4
 
 SLACK_COUNTS = 4  # one count at each end of the interval, and play in the gears
 
@@ -104,7 +104,7 @@ class CountsCheck(Struct):
     off: Motors = NONE  # by the counts minus by the speeds, rad
     doubt: Motors | None = None  # `off` of a window that ends with the last line and differs
 
-    def add(self, turned: Motors, speeds: Motors, dt: float, count: float) -> None:
+    def add(self, turned: Motors, speeds: Wheels4, dt: float, count: float) -> None:
         """Add a line: the angles by its counts, its speeds, and the time by the board's clock."""
         a, b, c, d = turned
         e, f, g, h = speeds

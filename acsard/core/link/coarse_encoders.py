@@ -13,8 +13,7 @@ from typing import Literal
 
 from msgspec import Struct, field
 
-from acsard.core.link.codec import Motors
-from acsard.core.values import Rad, RadPerS, Seconds
+from acsard.core.values import Rad, RadPerS, Seconds, Wheels4
 
 COARSEST_COUNT: Rad = 0.393  # of the coarsest expected encoder, with the rounding of its speed
 
@@ -35,13 +34,13 @@ MIN_JUMPS, CHANGES = 3, 256
 # Over a longer time than this, a change of speed may be an acceleration.
 MAX_INTERVAL_S = 0.03
 
-NONE: Motors = (0.0, 0.0, 0.0, 0.0)
+NONE: Wheels4 = (0.0, 0.0, 0.0, 0.0)
 
 
 class CoarseEncoders(Struct):
     found: Literal["", "fine", "coarse"] = ""
     lines: int = 0  # while they were coarse
-    speeds: Motors = NONE  # of the last line
+    speeds: Wheels4 = NONE  # of the last line
     seconds: Seconds = 0.0  # of the last line
     changes: int = 0  # in this block
     # Of each wheel: jumps in this block, and the direction of the last one.
@@ -52,7 +51,7 @@ class CoarseEncoders(Struct):
         """Forget all lines: the board has restarted or was replaced."""
         self.found, self.changes, self.jumps = "", 0, [0] * 4
 
-    def step(self, speeds: Motors, elapsed: Seconds) -> RadPerS:
+    def step(self, speeds: Wheels4, elapsed: Seconds) -> RadPerS:
         """Add a line, and return a bound of the change of a speed by one count; inf if unknown.
 
         `elapsed` is the time since the line before it, which may have been lost.
@@ -73,7 +72,7 @@ class CoarseEncoders(Struct):
             return LARGEST_JUMP / seconds
         return math.inf
 
-    def _compare(self, speeds: Motors, least: RadPerS, most: RadPerS) -> None:
+    def _compare(self, speeds: Wheels4, least: RadPerS, most: RadPerS) -> None:
         jumps, rises = self.jumps, self.rises
         for wheel, (now, before) in enumerate(zip(speeds, self.speeds, strict=True)):
             change = now - before

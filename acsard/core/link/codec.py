@@ -13,11 +13,11 @@ import re
 from typing import Literal
 
 from acsard.core.config.settings import WheelMap
-from acsard.core.values import STILL, AcsardError, WheelSpeeds
+from acsard.core.values import STILL, AcsardError, Wheels4, WheelSpeeds
 
 LETTERS = "abcd"
 
-Motors = tuple[float, float, float, float]
+Motors = tuple[float, float, float, float]  # a value of each motor, a to d, with the board's sign
 
 MAX_SPEED = 99.99  # rad/s, two digits before the point and two after it
 
@@ -80,7 +80,7 @@ class Codec:
         tokens = [_token(letter, sign * wheel[index]) for letter, index, sign in self._wiring]
         return ",".join(tokens).encode() + self._end
 
-    def wheels(self, motors: Motors) -> Motors:
+    def wheels(self, motors: Motors) -> Wheels4:
         """Return values of the motors a to d as values of the wheels, forward positive."""
         wheel = [0.0] * 4
         for motor, (_, index, sign) in zip(motors, self._wiring, strict=True):

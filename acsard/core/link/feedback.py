@@ -13,12 +13,11 @@ from acsard.core.config.wire_time import wire_ns
 from acsard.core.link.board_counts import CountsCheck, Encoders, Turned
 from acsard.core.link.checked_line import Reading
 from acsard.core.link.coarse_encoders import CoarseEncoders
-from acsard.core.link.codec import Motors
 from acsard.core.link.line_times import FreeRunning, Prompted
 from acsard.core.link.link_setup import LinkSetup
 from acsard.core.link.output import Output
 from acsard.core.link.whole_counts import WholeCounts
-from acsard.core.values import NS_PER_S, Instant, Ns, Rad, RadPerS, Seconds, WheelSpeeds
+from acsard.core.values import NS_PER_S, Instant, Ns, Rad, RadPerS, Seconds, Wheels4, WheelSpeeds
 
 # Only shorter gaps are filled: the board may have been reset in a longer one.
 MAX_FILLED_GAP_S = 1.0
@@ -41,17 +40,17 @@ class Line(Struct, frozen=True, gc=False):
     speeds: WheelSpeeds
     dt: Seconds
     gap: Seconds = 0.0
-    turned: Motors | None = None
+    turned: Wheels4 | None = None
     # Of `dt`, in which lines were lost. It comes first, and the odometry fills it.
     bridged: Seconds = 0.0
-    counted: Motors | None = None
+    counted: Wheels4 | None = None
     count: Rad = 0.0  # angle of one count; 0 if it is not declared
     step: RadPerS = 0.0  # change of a speed that one count explains; inf if unknown
     since: Seconds = 0.0  # by the board's clock or arrivals, for plausibility; 0 after a gap
     # From the previous sample to the end of the last command to move: the first line of zeros, or
     # the board's watchdog. It is negative if that was before the sample.
     driven: Seconds = 0.0
-    doubt: Motors | None = None  # angles by wrong counts, which earlier lines had too much, rad
+    doubt: Wheels4 | None = None  # angles by wrong counts, which earlier lines had too much, rad
     asked_ns: Ns | None = None  # when the answered command was written
     heard_ns: Ns = 0  # the host had the complete line
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from msgspec import Struct
 
-from acsard.core.link.codec import Motors
+from acsard.core.values import Wheels4
 
 ROUNDING = 0.0052  # of a speed with two decimals (0.005 rad/s), with a small margin
 
@@ -34,7 +34,7 @@ REPEATED_FRACTION = 0.55
 # Gain of `misfit`. Once it reaches the share, no line counts as whole counts.
 MISFIT_GAIN, MAX_MISFIT = 0.1, 0.3
 
-AT_REST: Motors = (0.0, 0.0, 0.0, 0.0)
+AT_REST: Wheels4 = (0.0, 0.0, 0.0, 0.0)
 
 
 class WholeCounts(Struct):
@@ -48,13 +48,13 @@ class WholeCounts(Struct):
     # s that the next estimate carries, and in which the firmware last counted.
     carried: float = 0.0
     period: float = 0.0
-    before: Motors = AT_REST
+    before: Wheels4 = AT_REST
     misfit: float = 0.0  # share of the last lines that are no whole counts
     covers_gap: bool = False  # the last line includes the counts of the missing line before it
 
     def turned(
-        self, angle: float, speeds: Motors, elapsed: float, jitter: float, gap: float = 0.0
-    ) -> Motors | None:
+        self, angle: float, speeds: Wheels4, elapsed: float, jitter: float, gap: float = 0.0
+    ) -> Wheels4 | None:
         """Return the angle of each wheel since the previous line, rad, if possible as counts.
 
         Otherwise it is speed times time. Return None if the firmware has no whole counts, or if the
@@ -106,7 +106,7 @@ class WholeCounts(Struct):
 
 
 def _number(
-    speeds: Motors, fastest: float, angle: float, expected: float
+    speeds: Wheels4, fastest: float, angle: float, expected: float
 ) -> tuple[int, bool | None]:
     # The count of the fastest wheel (0 if unknown), and whether the speeds are counts: True and
     # False are certain.

@@ -10,12 +10,11 @@ from __future__ import annotations
 from msgspec import Struct, field
 
 from acsard.core.config.settings import FeedbackConfig, OdometryConfig
-from acsard.core.link.codec import Motors
 from acsard.core.link.feedback import Line
 from acsard.core.motion.gyro import Gyro, Turn
 from acsard.core.motion.uncertainty import ErrorModel
 from acsard.core.motion.wheels import Wheels, new_wheels
-from acsard.core.values import Event, GyroStatus, Seconds, WheelsStatus
+from acsard.core.values import Event, GyroStatus, Seconds, Wheels4, WheelsStatus
 
 NO_ENCODERS = "feedback.encoders = false: the pose is what was commanded"
 
@@ -36,7 +35,7 @@ class ConsistencyChecks(Struct):
         return self.gyro.status if odometry.gyro else GyroStatus()
 
     def check_line(
-        self, model: ErrorModel, line: Line, rolled: Motors, seconds: Seconds, *, known: bool
+        self, model: ErrorModel, line: Line, rolled: Wheels4, seconds: Seconds, *, known: bool
     ) -> None:
         """Check a line, and set `turn`, `slips` and `events`.
 

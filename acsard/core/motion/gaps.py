@@ -9,13 +9,12 @@ from __future__ import annotations
 
 from msgspec import Struct
 
-from acsard.core.link.codec import Motors
 from acsard.core.link.feedback import MAX_FILLED_GAP_S, Line
-from acsard.core.values import Seconds
+from acsard.core.values import Seconds, Wheels4
 
 LONG_S = 0.06  # a line for more than this is judged like a gap
 
-AT_REST: Motors = (0.0, 0.0, 0.0, 0.0)
+AT_REST: Wheels4 = (0.0, 0.0, 0.0, 0.0)
 
 
 class Skipped(Struct):
@@ -25,7 +24,7 @@ class Skipped(Struct):
     lost: Seconds = 0.0  # without counts
     unknown: Seconds = 0.0
     counted: Seconds = 0.0
-    turned: Motors = AT_REST  # in `counted`, rad
+    turned: Wheels4 = AT_REST  # in `counted`, rad
 
     def add(self, line: Line) -> None:
         self.lines += 1
@@ -40,13 +39,13 @@ class Skipped(Struct):
 class Rolled(Struct, frozen=True, gc=False):
     """The angles that the wheels rolled since the last plausible line, rad."""
 
-    angles: Motors
+    angles: Wheels4
     seconds: Seconds  # in which they rolled them
     filled: Seconds  # part of `seconds` for which no line speaks
     unknown: Seconds  # in addition to `seconds`
 
 
-def rolled_over(skipped: Skipped, line: Line, before: Motors) -> Rolled:
+def rolled_over(skipped: Skipped, line: Line, before: Wheels4) -> Rolled:
     """Return the angles since the last plausible line, which had the speeds `before`, rad/s."""
     speeds = _confirmed(before, line.speeds.as_tuple())
     if line.turned is not None:
@@ -65,7 +64,7 @@ def rolled_over(skipped: Skipped, line: Line, before: Motors) -> Rolled:
     return Rolled(angles, seconds + filled, filled, unknown)
 
 
-def _confirmed(before: Motors, after: Motors) -> Motors:
+def _confirmed(before: Wheels4, after: Wheels4) -> Wheels4:
     # Motion changes both wheels of a side alike, damage one of them. In a usual line it matters
     # little; here, take the median of each wheel, the other one of its side and its last speed.
     fr, fl, rl, rr = after
@@ -76,9 +75,9 @@ def _confirmed(before: Motors, after: Motors) -> Motors:
     )  # fmt: skip
 
 
-def plus(a: Motors, b: Motors) -> Motors:
+def plus(a: Wheels4, b: Wheels4) -> Wheels4:
     return a[0] + b[0], a[1] + b[1], a[2] + b[2], a[3] + b[3]
 
 
-def times(a: Motors, factor: float) -> Motors:
+def times(a: Wheels4, factor: float) -> Wheels4:
     return a[0] * factor, a[1] * factor, a[2] * factor, a[3] * factor

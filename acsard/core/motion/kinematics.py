@@ -13,7 +13,7 @@ from __future__ import annotations
 import math
 
 from acsard.core.config.settings import DriveConfig
-from acsard.core.values import Metres, Rad, RadPerS, Twist, WheelSpeeds
+from acsard.core.values import Metres, Rad, RadPerS, Twist, Wheels4, WheelSpeeds
 
 
 class Kinematics:
@@ -45,7 +45,7 @@ class Kinematics:
         linear, angular = self.moved(speeds.as_tuple())
         return Twist(linear, angular)
 
-    def moved(self, wheels: tuple[float, float, float, float]) -> tuple[float, float]:
+    def moved(self, wheels: Wheels4) -> tuple[float, float]:
         """Return the distance, m, and the turn, rad, of rolled angles (or both per s of speeds)."""
         front_right, front_left, rear_left, rear_right = wheels
         left = self._left_radius * (front_left + rear_left) / 2

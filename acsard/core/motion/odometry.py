@@ -15,7 +15,6 @@ import math
 
 from msgspec import Struct, field
 
-from acsard.core.link.codec import Motors
 from acsard.core.link.feedback import Line
 from acsard.core.motion.consistency import ConsistencyChecks
 from acsard.core.motion.gaps import AT_REST, LONG_S, Rolled, Skipped, plus, rolled_over, times
@@ -31,6 +30,7 @@ from acsard.core.values import (
     Rad,
     Seconds,
     Twist,
+    Wheels4,
     WheelSpeeds,
 )
 
@@ -43,10 +43,10 @@ class Odometry(Struct):
     path: Path = Path()  # of base_link
     twist: Twist = REST  # in the last line
     speeds: WheelSpeeds = STILL  # in the last line
-    positions: Motors = AT_REST  # of the wheels, rad
+    positions: Wheels4 = AT_REST  # of the wheels, rad
     travelled: Metres = 0.0  # since the daemon started, forwards plus backwards
     skipped: Skipped = field(default_factory=Skipped)
-    held: Motors = AT_REST  # rad at rest; for the pose beyond two counts, or in a drive
+    held: Wheels4 = AT_REST  # rad at rest; for the pose beyond two counts, or in a drive
     rested: Seconds = math.inf  # of zero speeds, without gaps
     # The pose was set after the last line: a part of the motion since that line came before it.
     was_set: bool = False
@@ -150,7 +150,7 @@ class Odometry(Struct):
             self.positions, speeds, line.asked_ns, line.heard_ns,
         )  # fmt: skip
 
-    def _beyond_rocking(self, rolled: Motors, at_rest: bool, model: ErrorModel) -> Motors:
+    def _beyond_rocking(self, rolled: Wheels4, at_rest: bool, model: ErrorModel) -> Wheels4:
         # A wheel at rest may rock between the edges of a count.
         rolled, self.held = plus(self.held, rolled), AT_REST
         if at_rest and max(map(abs, rolled)) <= model.unsettled:

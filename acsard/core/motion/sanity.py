@@ -16,9 +16,8 @@ from operator import sub
 from msgspec import Struct
 
 from acsard.core.link.coarse_encoders import COARSEST_COUNT, JUMP_SPEED, MIN_COUNT_S
-from acsard.core.link.codec import Motors
 from acsard.core.link.feedback import Line
-from acsard.core.values import WHEELS, Event, RadPerS, WheelSpeeds
+from acsard.core.values import WHEELS, Event, RadPerS, Wheels4, WheelSpeeds
 
 FAULT_LINES = 3  # in a row: 30 ms at 100 Hz
 
@@ -35,7 +34,7 @@ COUNT_MARGIN = 2  # each of two reports may be wrong by one
 # Least time between two lines: while this computer catches up, one count would look fast.
 MIN_INTERVAL_S = 0.004
 
-NOT_FAST: Motors = (0.0, 0.0, 0.0, 0.0)
+NOT_FAST: Wheels4 = (0.0, 0.0, 0.0, 0.0)
 
 
 class Sanity(Struct):
@@ -54,7 +53,7 @@ class Sanity(Struct):
     count: int = 0  # of the last impossible lines
     # By how much each wheel turned further than at the limit, rad: the sum over possible lines,
     # which slower ones reduce. It is one count at most.
-    beyond: Motors = NOT_FAST
+    beyond: Wheels4 = NOT_FAST
     lines: int = 0  # of the window
     dropped: int = 0  # impossible ones of the window
     warning: Event | None = None  # only if the last line caused it
@@ -175,5 +174,5 @@ class Sanity(Struct):
         return ""
 
 
-def _proven(line: Line) -> Motors | None:
+def _proven(line: Line) -> Wheels4 | None:
     return line.counted if line.turned is None else line.turned

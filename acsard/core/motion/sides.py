@@ -12,8 +12,7 @@ from typing import Literal, NamedTuple
 
 from msgspec import Struct
 
-from acsard.core.link.codec import Motors
-from acsard.core.values import WHEELS, Event, Rad, RadPerS, Seconds
+from acsard.core.values import WHEELS, Event, Rad, RadPerS, Seconds, Wheels4
 
 SideName = Literal["left", "right"]
 
@@ -48,9 +47,9 @@ class Block(NamedTuple):
     """The sums of some lines, and the bounds for them."""
 
     s: Seconds
-    angles: Motors
-    line: Motors  # the angles of the last line
-    speeds: Motors  # in it
+    angles: Wheels4
+    line: Wheels4  # the angles of the last line
+    speeds: Wheels4  # in it
     unit: Rad  # of an encoder count
     limit: Rad  # evidence of a fault
     patience: Seconds  # without an approach

@@ -15,7 +15,6 @@ from msgspec import Struct
 
 from acsard.core.codes import Code, Reason, joined, reason
 from acsard.core.config.settings import FeedbackConfig
-from acsard.core.link.codec import Motors
 from acsard.core.motion.gaps import times
 from acsard.core.motion.kinematics import Kinematics
 from acsard.core.motion.sides import (
@@ -36,6 +35,7 @@ from acsard.core.values import (
     Rad,
     RadPerS,
     Seconds,
+    Wheels4,
     WheelSpeeds,
     WheelsStatus,
 )
@@ -76,7 +76,7 @@ ASSUMED_COUNTS = 16
 
 SIDE_OF, ACROSS = (1, 0, 0, 1), (1, 0, 3, 2)  # each wheel's side, and wheel on the other one
 
-NOTHING: Motors = (0.0, 0.0, 0.0, 0.0)
+NOTHING: Wheels4 = (0.0, 0.0, 0.0, 0.0)
 
 
 class Wheel(Struct):
@@ -113,7 +113,7 @@ class Wheels(Struct):
     commanded: WheelSpeeds | None = STILL
     late: bool = False  # this computer was late, so the board may have stopped the motors
     begins: bool = True  # the expected speeds begin at the measured ones
-    angles: Motors = NOTHING  # of the block, rad
+    angles: Wheels4 = NOTHING  # of the block, rad
     turn: Rad = 0.0  # of the block by a gyro
     by_gyro: bool = True  # it is known
     seconds: Seconds = 0.0
@@ -122,15 +122,15 @@ class Wheels(Struct):
     unreported_s: Seconds = REPEATED_S
     excludes: bool = False
     slips: bool = False  # the wheels of a side contradict each other
-    missed: tuple[tuple[SideName, Motors], ...] = ()  # by both wheels of a side
-    repair: Motors = NOTHING  # what the pose still has of a wheel that is left out now, rad
+    missed: tuple[tuple[SideName, Wheels4], ...] = ()  # by both wheels of a side
+    repair: Wheels4 = NOTHING  # what the pose still has of a wheel that is left out now, rad
     fault: Reason | None = None
     pushed: str = ""
     events: tuple[Event, ...] = ()
 
     def add(
         self,
-        turned: Motors,
+        turned: Wheels4,
         speeds: WheelSpeeds,
         dt: Seconds,
         turn: Rad | None,
@@ -177,7 +177,7 @@ class Wheels(Struct):
         self._drop()
         self._begin()
 
-    def believed(self, wheels: Motors) -> Motors:
+    def believed(self, wheels: Wheels4) -> Wheels4:
         """Return angles or speeds, with the other wheel of its side for one that is left out."""
         if not self.excludes:
             return wheels
@@ -185,9 +185,9 @@ class Wheels(Struct):
         for side in self.sides:
             if side.out >= 0:
                 values[side.out] = wheels[side.front + side.rear - side.out]
-        return _motors(values)
+        return _wheels4(values)
 
-    def possible_motion(self, wheels: Motors) -> list[tuple[SideName, Motors]]:
+    def possible_motion(self, wheels: Wheels4) -> list[tuple[SideName, Wheels4]]:
         """Return, by side, angles that may be true and that the pose leaves out, rad.
 
         Call this once for each line. A wheel that is left out may be blocked, or its motor may be
@@ -201,7 +201,7 @@ class Wheels(Struct):
             if out >= 0 and side.why != "repeats":
                 values = [0.0] * 4
                 values[out] = wheels[out] - wheels[other] - self.repair[out]
-                found.append((side.name, _motors(values)))
+                found.append((side.name, _wheels4(values)))
         return found
 
     @property
@@ -225,7 +225,7 @@ class Wheels(Struct):
             side.peak = side.next_peak = 0.0
 
     def _end_block(
-        self, line: Motors, speeds: Motors, lag: Seconds, kinematics: Kinematics, count: Rad
+        self, line: Wheels4, speeds: Wheels4, lag: Seconds, kinematics: Kinematics, count: Rad
     ) -> None:
         s, angles, commanded = self.seconds, self.angles, self.commanded
         if s > MAX_BLOCK_S:
@@ -385,7 +385,7 @@ class Wheels(Struct):
                 values = [0.0] * 4
                 values[side.front], values[side.rear] = one.missed, other.missed
                 one.missed = other.missed = 0.0
-                self.missed = (*self.missed, (side.name, _motors(values)))
+                self.missed = (*self.missed, (side.name, _wheels4(values)))
 
     def _compare(self, block: Block, kinematics: Kinematics) -> None:
         s, angles, count = block.s, block.angles, block.unit
@@ -407,7 +407,7 @@ class Wheels(Struct):
             if before < 0 <= side.out:
                 repair = list(self.repair)
                 repair[side.out] = side.repair
-                self.repair = _motors(repair)
+                self.repair = _wheels4(repair)
             if event is not None:
                 self.events = (*self.events, event)
         self.excludes = left.out >= 0 or right.out >= 0
@@ -478,7 +478,7 @@ def _nearer(one: RadPerS, other: RadPerS) -> RadPerS:
     return min(one, other, key=abs) if one * other > 0.0 else 0.0
 
 
-def _motors(values: list[float]) -> Motors:
+def _wheels4(values: list[float]) -> Wheels4:
     front_right, front_left, rear_left, rear_right = values
     return front_right, front_left, rear_left, rear_right
 
