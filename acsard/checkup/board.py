@@ -24,7 +24,7 @@ from acsard.core.link.board_status import STATUS, decode_status
 from acsard.core.link.checked_line import SAMPLE_REQUEST, SEQUENCES, seal, unseal
 from acsard.core.link.codec import LETTERS, Codec, FrameError, Motors
 from acsard.core.link.lines import LineReader
-from acsard.core.link.link_diagnosis import Heard
+from acsard.core.link.link_diagnosis import Traffic
 from acsard.core.link.link_state import WATCHDOG_S
 from acsard.core.values import NS_PER_S, WheelSpeeds
 
@@ -132,7 +132,7 @@ class Board:
         # Maps the number of each input to whether the board last reported it as pressed.
         self.inputs: dict[int, bool] = {}
         # Statistics of all bytes and lines received since the last call of `open`.
-        self.heard = Heard()
+        self.traffic = Traffic()
         self.sent_lines = 0
         self.sent_s = 0.0
         # The delays by which this computer ran the check too late. If the board is simulated on
@@ -155,7 +155,7 @@ class Board:
     def open(self, baud_rate: int) -> None:
         """Open the port at this baud rate, or change its rate. Discard all received lines."""
         self.wire.open(baud_rate)
-        self.baud_rate, self.heard = baud_rate, Heard()
+        self.baud_rate, self.traffic = baud_rate, Traffic()
         self.forget()
 
     def forget(self) -> None:
@@ -350,15 +350,15 @@ class Board:
     def _receive(self, until_ns: int) -> list[BoardReply]:
         new_replies = []
         for at_ns, data in self.wire.listen(until_ns):
-            self.heard.take(data)
+            self.traffic.take(data)
             for line, following in self._lines.feed(data):
                 if line.startswith(STATUS):
-                    self.heard.statuses += 1
+                    self.traffic.statuses += 1
                     self._take_status(line)
                     continue
                 at_s = (at_ns - wire_ns(following, self.baud_rate)) / NS_PER_S
                 reply = self._reply(line, at_s)
-                self.heard.line(line, reply is not None)
+                self.traffic.line(line, reply is not None)
                 self.good_run = self.good_run + 1 if reply is not None else 0
                 self.longest_run = max(self.longest_run, self.good_run)
                 if restart := self.restarts.check_line(line, at_s, reply):

@@ -35,7 +35,7 @@ def baud(board: Board) -> Finding:
     # The wait is long, because opening the port resets many boards.
     if _knock(board, BOOT_S):
         return outcomes.find("baud rate: right", {"mcu.baud_rate": configured}, rate=configured)
-    data = board.heard
+    data = board.traffic
     for rate in (rate for rate in reversed(get_args(Baud)) if rate != configured):
         board.open(rate)
         if _knock(board, 0.6):

@@ -7,7 +7,7 @@ from msgspec import Struct
 from acsard.core.codes import Code, Reason
 from acsard.core.config.settings import Config, SafetyConfig
 from acsard.core.link.session import McuSession
-from acsard.core.motion.battery import Battery
+from acsard.core.motion.battery import BatteryInput
 from acsard.core.motion.bumpers import Bumpers
 from acsard.core.motion.emergency_stop import DRIVER_FAULT_REASON, EmergencyStop
 from acsard.core.values import Cause, Event, Latches, Ns
@@ -32,7 +32,7 @@ INPUT_OF: dict[Code, str] = {
 class BoardInputs(Struct):
     estop: EmergencyStop
     bumpers: Bumpers
-    battery: Battery
+    battery: BatteryInput
     # Inputs that caused a latch in an earlier run, until the board reports them: no `clear` before.
     unreported: dict[str, Cause]
 
@@ -118,6 +118,6 @@ def inputs_after(latches: Latches, config: Config) -> BoardInputs:
     return BoardInputs(
         EmergencyStop(unpowered="emergency_stop" in codes),
         Bumpers(),
-        Battery(known="stop" if empty else "ok"),
+        BatteryInput(known="stop" if empty else "ok"),
         {INPUT_OF[cause.code]: cause for cause in causes if cause.code in INPUT_OF},
     )

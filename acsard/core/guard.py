@@ -17,9 +17,9 @@ from msgspec import Struct
 from acsard.core.config.settings import Config
 from acsard.core.values import NS_PER_S, Ns, Status, Trip
 
-Wheels = tuple[int, int, int, int]  # speeds of the motors a to d, in hundredths of rad/s
+Hundredths = tuple[int, int, int, int]  # speeds of the motors a to d, in hundredths of rad/s
 
-_ZERO: Wheels = (0, 0, 0, 0)
+_ZERO: Hundredths = (0, 0, 0, 0)
 _COLUMNS = re.compile(rb"a([pn]\d\d\.\d\d),b([pn]\d\d\.\d\d),c([pn]\d\d\.\d\d),d([pn]\d\d\.\d\d)")
 _SEAL = re.compile(rb"#[0-9A-F]{2}S?\*[0-9A-F]{4}\r\n")
 _QUESTION = b"?\r\n"
@@ -48,7 +48,7 @@ class Guard:
         # `stop` has zeros and no checksum: the board accepts it in any state of the link.
         self._stop = stop
         memory = memory or Memory()
-        self._last, self._wheels = memory.last, _wheels(memory.last[:31])
+        self._last, self._hundredths = memory.last, _hundredths(memory.last[:31])
         self._commanded_ns, self._halted_ns = memory.commanded_ns, memory.halted_ns
         self._longest = memory.ramp_ns, memory.stop_ramp_ns
         self.use(config)
@@ -63,7 +63,7 @@ class Guard:
         self._most = int(config.limits.wheel_speed * 100 + 1)
         self._timeouts = {s.name: s.timeout * 1e9 for s in config.commands.sources}
         self._ramps = _ramp_ns(config, stop=False), _ramp_ns(config, stop=True)
-        if self._wheels == _ZERO:
+        if self._hundredths == _ZERO:
             self._longest = self._ramps
         else:
             (ramp, stop_ramp), (now, stop_now) = self._longest, self._ramps
@@ -77,8 +77,8 @@ class Guard:
         """Record that `line` was written to the serial port."""
         if line == _QUESTION:
             return
-        self._last, self._wheels = line, _wheels(line[:31])
-        if self._wheels == _ZERO:
+        self._last, self._hundredths = line, _hundredths(line[:31])
+        if self._hundredths == _ZERO:
             self._longest = self._ramps
 
     def check(
@@ -102,8 +102,8 @@ class Guard:
         return (self._stop, trip) if trip else (line, "")
 
     def _objection(self, line: bytes, now_ns: Ns, commanded: bool, linked: bool) -> Trip:
-        before = self._wheels or _ZERO
-        wheels = _wheels(line[:31])
+        before = self._hundredths or _ZERO
+        wheels = _hundredths(line[:31])
         if wheels is None or not (line[31:] == self._stop[31:] or self._sealed(line)):
             return "guard_line_damaged"
         if wheels == _ZERO:
@@ -166,7 +166,7 @@ def _ramp_ns(config: Config, *, stop: bool) -> Ns:
 
 # A steady command repeats the same columns in each line, so a cache of a few lines saves most work.
 @lru_cache(4)
-def _wheels(columns: bytes) -> Wheels | None:
+def _hundredths(columns: bytes) -> Hundredths | None:
     # In 0.01 rad/s; None if a column is malformed. `columns` are the first 31 bytes of a line.
     match = _COLUMNS.match(columns)
     if match is None:

@@ -17,7 +17,7 @@ from acsard.host import clock
 from acsard.host.timerfd import TimerFd
 
 # Gets the time and the periods that have ended; returns whether the daemon goes on.
-Step = Callable[[Instant, Period], bool]
+StepFunction = Callable[[Instant, Period], bool]
 
 
 class Pulse:
@@ -31,12 +31,12 @@ class Pulse:
         self._period_ns = self._due_ns = 0  # the latter by the timer's clock
         self._next_ns = 0  # about the same time by the daemon's clock
         self._alarm_ns: Ns | None = None
-        self._step: Step | None = None  # None: none may run now
+        self._step: StepFunction | None = None  # None: none may run now
         self._pace: Pace
         self._over: asyncio.Future[None]
         self._early = self._command_waits = self._stop_waits = False
 
-    async def run(self, period_ns: Ns, step: Step, pace: Pace) -> None:
+    async def run(self, period_ns: Ns, step: StepFunction, pace: Pace) -> None:
         """Run `step` at the end of each period, and between, until it returns False.
 
         After each step, `pace` says which events may run another one before the period ends.

@@ -11,7 +11,7 @@ from prometheus_client import CONTENT_TYPE_LATEST, generate_latest
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
 from prometheus_client.registry import Collector
 
-from acsard.core.link.link_state import State
+from acsard.core.link.link_state import LinkState
 from acsard.core.messages.schema import RobotState
 from acsard.core.messages.state_warnings import WARNING_KINDS, warnings
 from acsard.core.motion.modes import Mode
@@ -93,7 +93,7 @@ def text(
 def _add_state(metrics: Metrics, state: RobotState) -> None:
     metrics.one_of("mode", "the robot's present mode", "mode", Mode, state.mode)
     what = "the present state of the link to the microcontroller"
-    metrics.one_of("link", what, "state", get_args(State), state.link)
+    metrics.one_of("link", what, "state", get_args(LinkState), state.link)
     warned = {item.what for item in warnings(state)}
     subjects = {(kind,): float(kind in warned) for kind in WARNING_KINDS}
     metrics.gauges("warning", "1 while the robot gives this warning, else 0", ("what",), subjects)

@@ -217,7 +217,7 @@ class Regulates(Robot):
         self.mcu.switches.firmware = "plain_only"
         vars(self.mcu)["understand"] = self._regulated
 
-    def _regulated(self, line: bytes) -> protocol.Command | None:
+    def _regulated(self, line: bytes) -> protocol.BoardCommand | None:
         command = protocol.reference(line)
         if command is None:
             return None

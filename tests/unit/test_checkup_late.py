@@ -119,7 +119,7 @@ def test_a_later_step_reports_a_fault_that_an_earlier_step_could_not_judge() -> 
         def wakes_late(self) -> bool:
             return self.looked and super().wakes_late()
 
-    def obeys(line: bytes) -> protocol.Command | None:
+    def obeys(line: bytes) -> protocol.BoardCommand | None:
         command = None if b"#" in line else protocol.reference(line)
         if command and not line.endswith(b",\r\n"):
             if robot.looked:

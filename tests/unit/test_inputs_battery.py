@@ -12,7 +12,7 @@ from acsard.core.motion.battery import (
     SILENCE_TIMEOUT_S,
     SILENT_REASON,
     TIME_CONSTANT_S,
-    Battery,
+    BatteryInput,
     status_text,
 )
 from acsard.core.motion.latches import after_restart
@@ -29,7 +29,7 @@ class Pack:
     """A battery monitor with a simulated time. The first step is at 10 s."""
 
     def __init__(self, config: BatteryConfig = CONFIG) -> None:
-        self.battery, self.config, self.now_ms, self.linked = Battery(), config, 10_000, True
+        self.battery, self.config, self.now_ms, self.linked = BatteryInput(), config, 10_000, True
         self.events: list[tuple[str, str]] = []
         self.stops = 0
 

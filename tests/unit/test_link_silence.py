@@ -12,13 +12,13 @@ from acsard.core.link.link_diagnosis import (
     FIRST_DIAGNOSIS_NS,
     MAX_UNANSWERED_FRACTION,
     WINDOW_LINES,
-    Heard,
     SilenceDiagnosis,
+    Traffic,
     UnansweredLines,
     describe_state,
 )
 from acsard.core.link.link_setup import LinkSetup
-from acsard.core.link.link_state import State
+from acsard.core.link.link_state import LinkState
 from acsard.core.link.step_times import StepTimes
 from tests.each import each
 from tests.unit.link_bench import GOOD, MS, STOP, LinkBench
@@ -59,7 +59,7 @@ HEARD: dict[str, tuple[bytes, str, str]] = {
 def test_the_diagnosis_says_what_was_received_and_how_it_looks(
     data: bytes, looks: str, counted: str
 ) -> None:
-    heard = Heard()
+    heard = Traffic()
     heard.take(data)
     for line, _ in LineReader().feed(data):
         heard.line(line, line + b"\r\n" == STOP)
@@ -75,7 +75,7 @@ def test_no_line_that_the_board_can_send_takes_long_to_classify() -> None:
         def once() -> int:
             start = process_time_ns()
             for _ in range(5):
-                Heard().line(line, good=False)
+                Traffic().line(line, good=False)
             return process_time_ns() - start
 
         return min(once() for _ in range(3))
@@ -94,18 +94,18 @@ def test_no_line_that_the_board_can_send_takes_long_to_classify() -> None:
 
 
 def test_it_comes_after_three_seconds_and_again_only_when_it_changes() -> None:
-    hearing, reports = SilenceDiagnosis(), []
+    silence, reports = SilenceDiagnosis(), []
     for tick in range(100):
         if tick > 50:
-            hearing.now.take(b"\x00")
-        if hearing.diagnose(tick * FIRST_DIAGNOSIS_NS // 10):
-            assert hearing.heard is not None
-            reports.append((tick, hearing.heard.code))
+            silence.now.take(b"\x00")
+        if silence.diagnose(tick * FIRST_DIAGNOSIS_NS // 10):
+            assert silence.complete is not None
+            reports.append((tick, silence.complete.code))
     assert reports == [(10, "received_nothing"), (60, "received_garbage")]
-    hearing.now.line(STOP, good=True)
-    hearing.forget()
-    assert (hearing.heard, hearing.now) == (None, Heard())
-    assert not hearing.diagnose(10 * FIRST_DIAGNOSIS_NS)
+    silence.now.line(STOP, good=True)
+    silence.forget()
+    assert (silence.complete, silence.now) == (None, Traffic())
+    assert not silence.diagnose(10 * FIRST_DIAGNOSIS_NS)
 
 
 @each(
@@ -164,7 +164,7 @@ def test_a_stale_link_is_blamed_on_the_board_unless_the_host_was_late(
 ) -> None:
     times = after(*steps, good=good)
     assert (times.late_s, describe_state(REAL, "stale", times).code) == (late_s, code)
-    states: list[State] = ["up", "booting", "down"]
+    states: list[LinkState] = ["up", "booting", "down"]
     assert [describe_state(REAL, state, times).code for state in states] == [
         "link_up", "booting", "port_closed",
     ]  # fmt: skip

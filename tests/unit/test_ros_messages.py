@@ -30,7 +30,7 @@ from acsard.core.ros.channels import (
     DEFINITIONS,
     STATE_CHANNEL,
     Channel,
-    State,
+    RosState,
     nested,
     published_channels,
     schema_text,
@@ -164,4 +164,4 @@ def test_null_fields_of_the_state_are_nan_in_ros() -> None:
     numbers = (message.linear, message.angular, message.feedback_age, message.sources[1].age)
     assert all(map(math.isnan, numbers))
     assert (len(message.wheels), len(message.bumpers), message.x) == (0, 0, 1.0)
-    assert Cdr(State).decode(Cdr(State).encode(unknown)) == unknown
+    assert Cdr(RosState).decode(Cdr(RosState).encode(unknown)) == unknown

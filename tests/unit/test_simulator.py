@@ -25,7 +25,7 @@ from acsard.core.config.settings import Baud, Config, McuConfig, SimConfig
 from acsard.core.simulator import protocol
 from acsard.core.simulator.baud_mismatch import garbled
 from acsard.core.simulator.fake_mcu import MS, RESET_NS, FakeMcu
-from acsard.core.simulator.protocol import Command, plain_only, prefix, reference
+from acsard.core.simulator.protocol import BoardCommand, plain_only, prefix, reference
 from acsard.core.simulator.virtual_wire import VirtualWire
 from acsard.daemon.serial.simulator_pty import SimPty
 from acsard.host import clock
@@ -212,11 +212,11 @@ def closed(body: bytes) -> bytes:
 @each(
     ("line", "command"),
     [
-        *((PLAIN + end, Command(VALUES)) for end in (b"\r\n", b"\n", b",\r\n", b",\n")),
-        (closed(PLAIN + b"#07"), Command(VALUES, b"07")),
-        (closed(PLAIN + b"#FFS"), Command(VALUES, b"FF", True)),
-        (closed(PLAIN + b"#00GSZ"), Command(VALUES, b"00", True)),
-        (closed(PLAIN + b",#A0S"), Command(VALUES, b"A0", True)),
+        *((PLAIN + end, BoardCommand(VALUES)) for end in (b"\r\n", b"\n", b",\r\n", b",\n")),
+        (closed(PLAIN + b"#07"), BoardCommand(VALUES, b"07")),
+        (closed(PLAIN + b"#FFS"), BoardCommand(VALUES, b"FF", True)),
+        (closed(PLAIN + b"#00GSZ"), BoardCommand(VALUES, b"00", True)),
+        (closed(PLAIN + b",#A0S"), BoardCommand(VALUES, b"A0", True)),
         *((line, None) for line in (
             PLAIN + b"#07\r\n", PLAIN + b"*0000\r\n", closed(PLAIN), closed(PLAIN + b"#7"),
             closed(PLAIN + b"#0a"), closed(PLAIN + b"#07s"), closed(PLAIN + b"#07A"),
@@ -228,7 +228,7 @@ def closed(body: bytes) -> bytes:
     ],
 )  # fmt: skip
 def test_a_plain_or_a_checked_line_is_a_command_and_any_other_is_none(
-    line: bytes, command: Command | None
+    line: bytes, command: BoardCommand | None
 ) -> None:
     assert reference(line) == command
     if b"#" not in line and b"*" not in line:

@@ -20,7 +20,7 @@ Name = Annotated[
         extra={"unit": "1 to 32 characters of A-Z a-z 0-9 _ -", "example": "app"},
     ),
 ]
-Frame = Annotated[
+FrameId = Annotated[
     str,
     Meta(
         pattern=r"^[A-Za-z0-9_][A-Za-z0-9_/]{0,63}\Z",
@@ -200,10 +200,10 @@ class DriveConfig(Struct, frozen=True):
 
 
 class JointsConfig(Struct, frozen=True):
-    front_right: Frame = "front_right_wheel_joint"
-    front_left: Frame = "front_left_wheel_joint"
-    rear_left: Frame = "rear_left_wheel_joint"
-    rear_right: Frame = "rear_right_wheel_joint"
+    front_right: FrameId = "front_right_wheel_joint"
+    front_left: FrameId = "front_left_wheel_joint"
+    rear_left: FrameId = "rear_left_wheel_joint"
+    rear_right: FrameId = "rear_right_wheel_joint"
 
     def as_tuple(self) -> tuple[str, str, str, str]:
         """Return the names of the four wheel joints in the order of `values.WHEELS`."""
@@ -287,8 +287,8 @@ class CommandsConfig(Struct, frozen=True):
 
 
 class OdometryConfig(Struct, frozen=True):
-    odom_frame: Frame = "odom"
-    base_frame: Frame = "base_link"
+    odom_frame: FrameId = "odom"
+    base_frame: FrameId = "base_link"
     publish_tf: bool = True
     gyro: bool = False
     gyro_scale_std: Deviation = 0.004
@@ -302,7 +302,7 @@ class OdometryConfig(Struct, frozen=True):
 
 class LidarConfig(Struct, frozen=True):
     publish_tf: bool = True
-    lidar_frame: Frame = "lidar_link"
+    lidar_frame: FrameId = "lidar_link"
     lidar_x_offset: Offset = 0.0
     lidar_y_offset: Offset = 0.0
     lidar_yaw: Angle = 0.0

@@ -35,12 +35,12 @@ STATUS_NS = NS_PER_S // 10  # between two status lines
 PressedInput = tuple[Ns, Ns, str, str]  # begin, end, field of the status line, value
 
 
-class Clock(Struct):
+class BoardClock(Struct):
     period_ns: Ns
     name: bytes = b""  # `FakeMcu` gives each one another, to tell it from an older one
 
 
-class Battery(Struct):
+class BoardBattery(Struct):
     minutes: float  # that a full one lasts at rest
     charge: float  # 0 to 1
     drained_ns: Ns  # when `charge` was computed
@@ -83,8 +83,8 @@ class Switches(Struct):
     # `silent` leaves the field out. The last fault of a field decides, except that each pressed
     # bumper is reported.
     inputs: tuple[PressedInput, ...] = ()
-    battery: Battery | None = None
-    clocks: dict[str, Clock] = {}  # of what the board does by itself
+    battery: BoardBattery | None = None
+    clocks: dict[str, BoardClock] = {}  # of what the board does by itself
 
 
 class Fault(Struct, frozen=True):
@@ -120,7 +120,7 @@ def _reporting(s: Switches, field: str, value: str, after: float = 0, lasts: flo
     begin_ns = s.now_ns + int(after * NS_PER_S)
     end_ns = begin_ns + int(lasts * NS_PER_S) if lasts else NEVER_NS
     inputs = (*s.inputs, (begin_ns, end_ns, field, value))
-    return replace(s, inputs=inputs, clocks={"inputs": Clock(STATUS_NS)} | s.clocks)
+    return replace(s, inputs=inputs, clocks={"inputs": BoardClock(STATUS_NS)} | s.clocks)
 
 
 def _pressed(s: Switches, number: float, after: float, lasts: float) -> Switches:
@@ -129,12 +129,12 @@ def _pressed(s: Switches, number: float, after: float, lasts: float) -> Switches
 
 
 def _with_battery(s: Switches, percent: float, minutes: float) -> Switches:
-    battery = Battery(minutes, percent / 100, s.now_ns, s.now_ns)
-    return replace(s, battery=battery, clocks=s.clocks | {"battery": Clock(STATUS_NS)})
+    battery = BoardBattery(minutes, percent / 100, s.now_ns, s.now_ns)
+    return replace(s, battery=battery, clocks=s.clocks | {"battery": BoardClock(STATUS_NS)})
 
 
 def _free_running(s: Switches, period_s: float = 0.1) -> Switches:
-    clocks = s.clocks | {"report": Clock(_ns(period_s))}
+    clocks = s.clocks | {"report": BoardClock(_ns(period_s))}
     return replace(s, clocks=clocks, unpadded_replies=True, ending=",\r\n")
 
 
@@ -250,7 +250,7 @@ FAULTS = {
         "give the battery's charge at the start, 0 to 100 %, then the minutes that a full battery "
         "lasts"),
     "reset": Fault("SECONDS", "The board restarts every SECONDS.",
-        lambda s, period_s: replace(s, clocks=s.clocks | {"reset": Clock(_ns(period_s))}),
+        lambda s, period_s: replace(s, clocks=s.clocks | {"reset": BoardClock(_ns(period_s))}),
         lambda period_s: period_s > 0,
         "the seconds between resets must be above 0"),
 }

@@ -21,7 +21,7 @@ Motors = tuple[float, float, float, float]  # a value of each motor, a to d, wit
 
 MAX_SPEED = 99.99  # rad/s, two digits before the point and two after it
 
-Reason = Literal[
+RejectReason = Literal[
     "malformed", "duplicate_wheel", "over_range", "without_crc", "crc_error", "stale_sequence",
     "repeated",
     "status_malformed", "status_without_crc", "status_crc_error",
@@ -35,7 +35,7 @@ _LINE = re.compile(TOKENS + rb"(?:, *)?")
 class FrameError(AcsardError):
     """An invalid line from the board; `reason` is the kind of error, such as "crc_error"."""
 
-    def __init__(self, reason: Reason, line: bytes) -> None:
+    def __init__(self, reason: RejectReason, line: bytes) -> None:
         super().__init__(reason, line)
         self.reason = reason
 

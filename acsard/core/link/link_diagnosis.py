@@ -15,8 +15,7 @@ from acsard.core.codes import CODES, Reason, sentence
 from acsard.core.formatting import many, printable_bytes
 from acsard.core.link.codec import TOKENS
 from acsard.core.link.link_setup import LinkSetup
-from acsard.core.link.link_state import Link
-from acsard.core.link.link_state import State as LinkState
+from acsard.core.link.link_state import Link, LinkState
 from acsard.core.link.step_times import StepTimes
 from acsard.core.values import NS_PER_S, Event, Ns
 
@@ -74,7 +73,7 @@ WINDOW_LINES = 1000  # sent lines whose answers are counted: 10 s at 100 Hz
 MAX_UNANSWERED_FRACTION = 0.02  # a good link loses no answer
 
 
-class Heard(Struct):
+class Traffic(Struct):
     """The bytes and lines that the daemon received in an interval without a link."""
 
     size: int = 0  # bytes, without status lines
@@ -151,13 +150,13 @@ class Heard(Struct):
 class SilenceDiagnosis(Struct):
     """The diagnosis of why the link is not up, renewed every `FIRST_DIAGNOSIS_NS`."""
 
-    heard: Heard | None = None  # of the last complete interval, if there is a diagnosis
-    now: Heard = field(default_factory=Heard)  # of the present interval
+    complete: Traffic | None = None  # of the last complete interval, if there is a diagnosis
+    now: Traffic = field(default_factory=Traffic)  # of the present interval
     since_ns: Ns | None = None
 
     def forget(self) -> None:
         """Discard the diagnosis: the link is up, the output blocked, or the port changed."""
-        self.heard, self.now, self.since_ns = None, Heard(), None
+        self.complete, self.now, self.since_ns = None, Traffic(), None
 
     def diagnose(self, now_ns: Ns, late_s: float = 0.0) -> bool:
         """Process a step without a link, and return whether the diagnosis is of a new class."""
@@ -167,9 +166,9 @@ class SilenceDiagnosis(Struct):
             self.now.late_s = max(self.now.late_s, late_s)
         if now_ns - self.since_ns < FIRST_DIAGNOSIS_NS:
             return False
-        before, self.heard = self.heard, self.now
-        self.now, self.since_ns = Heard(), now_ns
-        return before is None or before.code != self.heard.code
+        before, self.complete = self.complete, self.now
+        self.now, self.since_ns = Traffic(), now_ns
+        return before is None or before.code != self.complete.code
 
 
 class UnansweredLines(Struct):
@@ -216,7 +215,7 @@ def describe_link(
     """Return a sentence about the link while the port is open."""
     checked = setup.checked
     if link.state in ("booting", "stale"):
-        traffic = silence.heard
+        traffic = silence.complete
         if traffic is not None and not traffic.good:
             return traffic.diagnosis(checked)
         if checked and link.damaged:

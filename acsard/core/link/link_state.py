@@ -15,13 +15,13 @@ from msgspec import Struct
 
 from acsard.core.values import NS_PER_S, Ns
 
-State = Literal["down", "booting", "up", "stale"]
+LinkState = Literal["down", "booting", "up", "stale"]
 Input = Literal[
     "closed", "opened", "restarted", "trusted", "silent", "damaged", "blocked", "repeated"
 ]
 
 # A pair without an entry does not change the state.
-TRANSITIONS: dict[tuple[State, Input], State] = {
+TRANSITIONS: dict[tuple[LinkState, Input], LinkState] = {
     ("down", "opened"): "booting",
     ("booting", "closed"): "down",
     ("booting", "opened"): "booting",
@@ -56,7 +56,7 @@ SPARSE_SILENCES = 2
 class Link(Struct):
     """The state of the link, which only `apply` changes, and its counts of good and bad lines."""
 
-    state: State = "down"
+    state: LinkState = "down"
     sparse_s: float = 0.0  # between the last two good lines, after `SPARSE_SILENCES`; else 0
     silences: int = 0
     good_in_row: int = 0

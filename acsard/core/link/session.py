@@ -21,8 +21,7 @@ from acsard.core.link.feedback import Line, Timeline
 from acsard.core.link.lines import LineReader
 from acsard.core.link.link_diagnosis import SilenceDiagnosis
 from acsard.core.link.link_setup import LinkSetup
-from acsard.core.link.link_state import GOOD_LINES, WATCHDOG_NS, WATCHDOG_S, Link
-from acsard.core.link.link_state import State as LinkState
+from acsard.core.link.link_state import GOOD_LINES, WATCHDOG_NS, WATCHDOG_S, Link, LinkState
 from acsard.core.link.output import QUESTION_LINE, Output
 from acsard.core.link.pose_warning import PoseWarning
 from acsard.core.link.step_times import StepTimes
@@ -83,7 +82,7 @@ class McuSession(Struct):
     _echo: EchoCheck = field(default_factory=EchoCheck)
     _link: Link = field(default_factory=Link)
     _timeline: Timeline = field(default_factory=Timeline)
-    _hearing: SilenceDiagnosis = field(default_factory=SilenceDiagnosis)
+    _silence: SilenceDiagnosis = field(default_factory=SilenceDiagnosis)
 
     # Results of the last `update`.
     restarted: bool = False  # it began a new session
@@ -203,7 +202,7 @@ class McuSession(Struct):
             return link_diagnosis.PORT_BLOCKED
         if self._trouble and self.link in ("booting", "stale"):
             return sentence(self._trouble)
-        return link_diagnosis.describe_link(setup, self._link, self._hearing, self.steps)
+        return link_diagnosis.describe_link(setup, self._link, self._silence, self.steps)
 
     @property
     def _trouble(self) -> Trouble:
@@ -244,7 +243,7 @@ class McuSession(Struct):
         self.blocked = False
         out.reopen(now_ns, port_open)
         self._lines.clear()
-        self._hearing.forget()
+        self._silence.forget()
         self._echo = EchoCheck()
         self._plain_lines, self._unchecked = 0, False
         self._says_samples = setup.mcu.wants_samples
@@ -286,8 +285,8 @@ class McuSession(Struct):
             self.status.forget_other_board(now_ns, up, late=self.steps.step_s > 0.0)
         if up or self.blocked:
             if self.blocked or not was_up:  # the diagnosis of a link that stays up is empty
-                self._hearing.forget()
-        elif self._hearing.diagnose(now_ns, self.steps.step_s):
+                self._silence.forget()
+        elif self._silence.diagnose(now_ns, self.steps.step_s):
             # The board may answer only plain lines, such as the first one after the opening.
             self._unchecked = self._unchecked or self._plain_lines > 0
             why = self.describe_link(setup)
@@ -341,7 +340,7 @@ class McuSession(Struct):
                 data = b"\n".join([line for line, _ in lines])
                 break
         if link.state != "up":
-            self._hearing.now.take(data)
+            self._silence.now.take(data)
         if lines:
             timeline.process_read(setup, out, piece.at, len(piece.data), len(lines), lines[-1][1])
         for line, following in lines:
@@ -352,7 +351,7 @@ class McuSession(Struct):
             else:
                 feedback.append(reply)
             if link.state != "up":
-                self._hearing.now.line(line, reply is not None)
+                self._silence.now.line(line, reply is not None)
         return feedback
 
     def _without_remarks(
@@ -386,7 +385,7 @@ class McuSession(Struct):
             self._reject(error.reason, line)
             return
         if self._link.state != "up":
-            self._hearing.now.statuses += 1
+            self._silence.now.statuses += 1
 
     def _line(
         self, setup: LinkSetup, out: Output, line: bytes, read_at: Instant, following: int

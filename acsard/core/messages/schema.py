@@ -15,7 +15,7 @@ from typing import Annotated, get_args
 from msgspec import Meta, Struct, field
 
 from acsard.core.codes import Code, PoseCode, StateCode, WaitCode, received_text
-from acsard.core.link.link_state import State
+from acsard.core.link.link_state import LinkState
 from acsard.core.messages.certificate_expiry import CertificateCode
 from acsard.core.messages.keys_and_roles import Direction
 from acsard.core.motion.modes import Mode
@@ -32,7 +32,7 @@ from acsard.core.values import (
 )
 
 # These annotations tell `cdr.py` the width of a number and the fixed length of an array.
-Seconds = Annotated[int, Meta(ge=-(2**31), le=2**31 - 1, extra={"cdr": "i"})]
+StampSeconds = Annotated[int, Meta(ge=-(2**31), le=2**31 - 1, extra={"cdr": "i"})]
 Nanoseconds = Annotated[int, Meta(ge=0, lt=NS_PER_S, extra={"cdr": "I"})]
 Byte = Annotated[int, Meta(ge=0, le=255, extra={"cdr": "B"})]
 Float32 = Annotated[float, Meta(extra={"cdr": "f"})]
@@ -65,7 +65,7 @@ class Message(Struct, frozen=True):
 class Time(Message, frozen=True):
     """Wall-clock time since 1970-01-01 UTC. `sec` is an int32 as in ROS."""
 
-    sec: Seconds = 0
+    sec: StampSeconds = 0
     nanosec: Nanoseconds = 0
 
     @classmethod
@@ -414,7 +414,7 @@ class RobotState(Message, frozen=True):
     """Measured turn rate, rad/s, left is positive; null without feedback."""
     wheels: list[float]
     """Measured speeds, rad/s, in the order front right, front left, rear left, rear right."""
-    link: Annotated[str, one_of(get_args(State))]
+    link: Annotated[str, one_of(get_args(LinkState))]
     """State of the serial link to the board."""
     source: str
     """Name of the selected source; empty if none is selected."""

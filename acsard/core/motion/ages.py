@@ -16,7 +16,7 @@ from msgspec import Struct
 from acsard.core.codes import AgeCode
 from acsard.core.values import NS_PER_S, Command, Ns
 
-Verdict = Literal[AgeCode, ""]
+AgeVerdict = Literal[AgeCode, ""]
 
 MARGIN_NS = NS_PER_S // 20  # distance of two beats, and jitter of the delays on a sound LAN
 
@@ -47,7 +47,7 @@ class Order(Struct, gc=False):
     old_ns: Ns | None = None  # first command since then that was too old
     round_trip_ns: Ns = 0  # least age of these commands
 
-    def judge_echo(self, command: Command, timeout_ns: Ns) -> Verdict:
+    def judge_echo(self, command: Command, timeout_ns: Ns) -> AgeVerdict:
         age_ns, at_ns = command.age_ns, command.arrived_ns
         if command.echo is None:
             return "no_echo"
@@ -91,15 +91,15 @@ class Clock(Struct):
     low: int = 0  # lowest delay of a proof
     since_ns: Ns | None = None  # a proof runs, in which the delay has not fallen since then
     first_refused: tuple[Ns, Ns] | None = None  # arrival and stamp of the first refused command
-    cause: Verdict = ""  # of refusals that last
+    cause: AgeVerdict = ""  # of refusals that last
     advance: float = 0.0  # of the stamps, s per second, while refusals last
     behind: int = 0  # delay above the least one
 
-    def judge_stamp(self, at_ns: Ns, stamp_ns: Ns, timeout_ns: Ns) -> Verdict:
+    def judge_stamp(self, at_ns: Ns, stamp_ns: Ns, timeout_ns: Ns) -> AgeVerdict:
         still = self._stands_still(at_ns, stamp_ns, timeout_ns)
         delay, least = at_ns - stamp_ns, self._risen(at_ns, timeout_ns)
         self.at_ns, self.stamp_ns, self.least = at_ns, stamp_ns, least
-        verdict: Verdict
+        verdict: AgeVerdict
         if least is None or delay < least - MARGIN_NS:
             verdict = self._prove(at_ns, delay, timeout_ns)
         else:
@@ -124,7 +124,7 @@ class Clock(Struct):
         risen = self.least + (at_ns - self.at_ns) // RISE_DIVISOR
         return max(self.least, min(risen, min(self.lows) + timeout_ns))
 
-    def _prove(self, at_ns: Ns, delay: int, timeout_ns: Ns) -> Verdict:
+    def _prove(self, at_ns: Ns, delay: int, timeout_ns: Ns) -> AgeVerdict:
         # A new clock, or a lower delay of a known one: the delays of one timeout must not fall.
         fallen = self.low - delay
         if self.since_ns is None or fallen > (at_ns - self.since_ns) // 100 + NS_PER_S // 1000:
@@ -145,7 +145,7 @@ class Clock(Struct):
                 self.still_ns = at_ns
         return self.still_ns is not None and at_ns - self.still_ns <= LASTING_NS
 
-    def _lasting(self, verdict: Verdict, at_ns: Ns, stamp_ns: Ns) -> Verdict:
+    def _lasting(self, verdict: AgeVerdict, at_ns: Ns, stamp_ns: Ns) -> AgeVerdict:
         # Name the cause of refusals that go on: it is looked for again every `LASTING_NS`.
         if self.first_refused is None:
             self.first_refused = at_ns, stamp_ns
@@ -164,7 +164,7 @@ class Ages(Struct):
 
     clocks: dict[str, Clock] = {}
 
-    def judge_age(self, command: Command, last: Order, timeout_ns: Ns, stalled: bool) -> Verdict:
+    def judge_age(self, command: Command, last: Order, timeout_ns: Ns, stalled: bool) -> AgeVerdict:
         """Return "" if the command is young enough and newer than the last accepted one.
 
         `stalled`: the daemon stood still just now, so a command without a stamp may be old.

@@ -38,7 +38,7 @@ MIN_TURN_RATE = 0.1  # rad/s of the wheels; less may be a count, or unequal tyre
 PROVING_TURN, REFUTING_TURN, MAX_MORE = 0.1, 0.4, 0.3
 MIN_DEGREES_RATIO, MAX_DEGREES_RATIO = 15.0, 150.0  # 57 without slip and errors
 
-Verdict = Literal["none yet", "good", "reversed", "in degrees", "dead", "not believed"]
+GyroVerdict = Literal["none yet", "good", "reversed", "in degrees", "dead", "not believed"]
 
 
 class Claims(Struct, frozen=True, gc=False):
@@ -95,7 +95,7 @@ class Compared(Struct):
 
 
 class Agreement(Struct):
-    verdict: Verdict = "none yet"
+    verdict: GyroVerdict = "none yet"
     disagrees_s: Seconds = 0.0  # remaining
     block: Compared = field(default_factory=Compared)
     straight: Compared = field(default_factory=Compared)
@@ -173,7 +173,7 @@ class Agreement(Struct):
         return contradiction, doubt
 
 
-def _named(ratio: float) -> Verdict:
+def _named(ratio: float) -> GyroVerdict:
     if MIN_DEGREES_RATIO <= abs(ratio) <= MAX_DEGREES_RATIO:
         return "in degrees"
     if -MAX_RATIO <= ratio <= -MIN_RATIO:

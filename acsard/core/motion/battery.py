@@ -76,7 +76,7 @@ def empty_reason(config: BatteryConfig) -> Reason:
     return reason("battery_empty", threshold=_threshold(config, "stop"), charged=charged)
 
 
-class Battery(Struct):
+class BatteryInput(Struct):
     """The battery values that the board reports, and the battery level computed from them."""
 
     status: BatteryStatus | None = None  # until voltage or charge is reported

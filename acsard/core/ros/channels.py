@@ -165,18 +165,18 @@ def _struct(name: str) -> type[Struct]:
 
 STATE_TYPE = ACSARD_PREFIX + "RobotState"
 
-State = _struct(STATE_TYPE)
+RosState = _struct(STATE_TYPE)
 
 
 def state(message: RobotState) -> Struct:
     """Convert a `RobotState` to the type of ROS. CDR has no maps, so the counters are a list."""
-    same = {name: getattr(message, name, None) for name in State.__struct_fields__}
+    same = {name: getattr(message, name, None) for name in RosState.__struct_fields__}
     other = {
         "header": Header(message.stamp),
         "bumpers": message.bumpers or [],
         "counters": [{"name": name, "count": count} for name, count in message.counters.items()],
     }
-    return convert(same | other, State, from_attributes=True)
+    return convert(same | other, RosState, from_attributes=True)
 
 
 ENCODING, SCHEMA_ENCODING = "cdr", "ros2msg"  # in MCAP and in Foxglove's protocol
@@ -203,7 +203,7 @@ class Channel(Struct, frozen=True):
         return schema_text(self.schema_name)
 
     def encode(self, message: Any) -> bytes:
-        """Encode a message as CDR; a `RobotState` becomes `State`."""
+        """Encode a message as CDR; a `RobotState` becomes `RosState`."""
         return encode(state(message) if isinstance(message, RobotState) else message, "cdr")
 
 
@@ -218,7 +218,7 @@ def _published() -> dict[str, Channel]:
     return channels
 
 
-STATE_CHANNEL = Channel("state", "state", STATE_TYPE, State)
+STATE_CHANNEL = Channel("state", "state", STATE_TYPE, RosState)
 
 # Each event is one log message.
 LOG_CHANNEL = Channel("log", "events", "rcl_interfaces/msg/Log", Log, Qos(1000))

@@ -20,8 +20,8 @@ from acsard.core.config.settings import Config, WheelMap
 from acsard.core.config.simulated_faults import (
     FAULTS,
     NEVER_NS,
-    Battery,
-    Clock,
+    BoardBattery,
+    BoardClock,
     Switches,
     parse,
 )
@@ -172,19 +172,19 @@ class FakeMcu:
         for begin_ns, end_ns, _, _ in self.switches.inputs:
             self._schedule_changes(begin_ns, end_ns)
 
-    def _tick(self, now_ns: Ns, what: str, clock: Clock) -> None:
+    def _tick(self, now_ns: Ns, what: str, clock: BoardClock) -> None:
         if what == "reset":
             self.reset(now_ns)
             return
         if what == "report" and now_ns >= self._boot_until_ns:
-            self._reply(now_ns, protocol.Command({}))
+            self._reply(now_ns, protocol.BoardCommand({}))
         elif what == "inputs":
             self._send_inputs(now_ns)
         elif what == "battery" and self.switches.battery:
             self._send_battery(now_ns, self.switches.battery)
         self._schedule_tick(now_ns, what, clock)
 
-    def _schedule_tick(self, now_ns: Ns, what: str, clock: Clock) -> None:
+    def _schedule_tick(self, now_ns: Ns, what: str, clock: BoardClock) -> None:
         self._schedule(now_ns + clock.period_ns, what, clock.name)
 
     def _schedule(self, due_ns: Ns, what: str, data: bytes) -> None:
@@ -228,7 +228,7 @@ class FakeMcu:
         if "report" not in self.switches.clocks:
             self._reply(now_ns, command)
 
-    def understand(self, line: bytes) -> protocol.Command | None:
+    def understand(self, line: bytes) -> protocol.BoardCommand | None:
         """Decode a line of the host as the firmware does."""
         return protocol.DECODERS[self.switches.firmware](line)
 
@@ -240,7 +240,7 @@ class FakeMcu:
                 protocol.identity(self._counts, switches.watchdog_ns // MS, switches.samples),
             )
 
-    def _reply(self, now_ns: Ns, command: protocol.Command) -> None:
+    def _reply(self, now_ns: Ns, command: protocol.BoardCommand) -> None:
         switches = self.switches
         if switches.muted or now_ns - self._replied_ns < switches.reply_gap_ns:
             return
@@ -339,7 +339,7 @@ class FakeMcu:
         if not self.switches.muted and now_ns >= self._boot_until_ns:
             self._send(now_ns, self._damaged(protocol.status(fields, self._checks)))
 
-    def _send_battery(self, now_ns: Ns, battery: Battery) -> None:
+    def _send_battery(self, now_ns: Ns, battery: BoardBattery) -> None:
         seconds, battery.drained_ns = (now_ns - battery.drained_ns) / NS_PER_S, now_ns
         turning = sum(map(abs, self.vehicle.set_points))
         if not turning:

@@ -22,7 +22,7 @@ _LINE = re.compile(rb"a([pn]\d\d\.\d\d),b([pn]\d\d\.\d\d),c([pn]\d\d\.\d\d),d([p
 PLAIN_LENGTH = 31  # bytes, without a trailing comma and the line end
 
 
-class Command(Struct, frozen=True):
+class BoardCommand(Struct, frozen=True):
     """A valid command line from the host."""
 
     values: dict[int, float]  # rad/s, by motor (0 to 3 for a to d)
@@ -30,7 +30,7 @@ class Command(Struct, frozen=True):
     wants_sample: bool = False  # the reply must contain the board's time and its encoder counts
 
 
-def reference(line: bytes) -> Command | None:
+def reference(line: bytes) -> BoardCommand | None:
     """Decode a plain or checked line as the reference firmware does; None if it is not valid."""
     text = line.removesuffix(b"\n").removesuffix(b"\r")
     if b"#" not in text and b"*" not in text:
@@ -45,20 +45,20 @@ def reference(line: bytes) -> Command | None:
     if not all(0x47 <= letter <= 0x5A for letter in letters):  # G to Z
         return None
     command = _plain(plain)
-    return command and Command(command.values, sequence, b"S" in letters)
+    return command and BoardCommand(command.values, sequence, b"S" in letters)
 
 
-def plain_only(line: bytes) -> Command | None:
+def plain_only(line: bytes) -> BoardCommand | None:
     """Decode a line as firmware without checksums does; None if it is not plain."""
     return _plain(line.removesuffix(b"\n").removesuffix(b"\r"))
 
 
-def prefix(line: bytes) -> Command | None:
+def prefix(line: bytes) -> BoardCommand | None:
     """Decode a line and ignore all after the four speeds, as some firmware does, or return None."""
     return _plain(line[:PLAIN_LENGTH])
 
 
-def latched(line: bytes) -> Command:
+def latched(line: bytes) -> BoardCommand:
     """Decode a line as old firmware does: obey each speed that is followed by a comma.
 
     The rest of the line need not be valid.
@@ -73,11 +73,11 @@ def latched(line: bytes) -> Command:
                 continue
             if math.isfinite(value):
                 values[MOTORS.encode().index(motor)] = value if sign == b"p" else -value
-    return Command(values)
+    return BoardCommand(values)
 
 
 # By firmware.
-DECODERS: dict[str, Callable[[bytes], Command | None]] = {
+DECODERS: dict[str, Callable[[bytes], BoardCommand | None]] = {
     "reference": reference,
     "plain_only": plain_only,
     "prefix": prefix,
@@ -85,9 +85,9 @@ DECODERS: dict[str, Callable[[bytes], Command | None]] = {
 }
 
 
-def _plain(text: bytes) -> Command | None:
+def _plain(text: bytes) -> BoardCommand | None:
     values = _values(text)
-    return None if values is None else Command(dict(enumerate(values)))
+    return None if values is None else BoardCommand(dict(enumerate(values)))
 
 
 # A robot at a constant speed gets the same values again and again, so they are cached.
