@@ -103,19 +103,19 @@ class Guard:
 
     def _objection(self, line: bytes, now_ns: Ns, commanded: bool, linked: bool) -> Trip:
         before = self._hundredths or _ZERO
-        wheels = _hundredths(line[:31])
-        if wheels is None or not (line[31:] == self._stop[31:] or self._sealed(line)):
+        speeds = _hundredths(line[:31])
+        if speeds is None or not (line[31:] == self._stop[31:] or self._sealed(line)):
             return "guard_line_damaged"
-        if wheels == _ZERO:
+        if speeds == _ZERO:
             return ""
-        if max(wheels) > self._most or min(wheels) < -self._most:
+        if max(speeds) > self._most or min(speeds) < -self._most:
             return "guard_too_fast"
         if not linked:
             return "guard_no_link"
         if self._require_check and b"#" not in line:
             return "guard_no_checksum"
-        grows = wheels != before and any(
-            abs(new) > abs(old) or new * old < 0 for new, old in zip(wheels, before, strict=True)
+        grows = speeds != before and any(
+            abs(new) > abs(old) or new * old < 0 for new, old in zip(speeds, before, strict=True)
         )
         if grows and not commanded:
             return "guard_no_command"

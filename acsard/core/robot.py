@@ -277,9 +277,15 @@ class Robot:
         motion, speeds = (AT_REST, STILL) if trip else (last.motion, last.speeds)
         silent, is_robots = session.silent(last.made_ns), not trip
         state.out.wrote(
-            self.link_setup, line, at_ns, last.made_ns, motion, speeds,
-            silent=silent, is_robots=is_robots,
-        )  # fmt: skip
+            self.link_setup,
+            line,
+            at_ns,
+            last.made_ns,
+            motion,
+            speeds,
+            silent=silent,
+            is_robots=is_robots,
+        )
         if line == QUESTION_LINE:
             session.asks(at_ns)
 
