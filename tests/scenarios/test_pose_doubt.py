@@ -7,7 +7,7 @@ from collections.abc import Callable
 
 import pytest
 
-from acsard.core.config.settings import Config, McuConfig, SimConfig
+from acsard.core.config.settings import Config, McuConfig, SimConfig, WheelMap
 from acsard.core.values import Received
 from tests.scenarios.world import World
 
@@ -54,6 +54,19 @@ def test_what_wrong_counts_moved_before_they_were_noticed_is_a_doubt(
     robot.drive(0.5, 0.0, 1.5)
     robot.hold(0.0, 0.0, 1.0)
     assert sigmas(robot) < 3.0
+
+
+def test_what_wrong_counts_moved_is_the_same_doubt_with_any_wiring() -> None:
+    def covariance(wheels: WheelMap) -> list[float]:
+        mcu = McuConfig(link_check="on", encoder_counts=16, wheels=wheels)
+        robot = World(Config(mcu=mcu, sim=SimConfig(encoder_counts=64)))
+        robot.run(0.5)
+        robot.drive(0.5, 0.0, 1.5)
+        robot.hold(0.0, 0.0, 1.0)
+        return robot.odom.pose.covariance
+
+    swapped = covariance(WheelMap(front_left="-a", front_right="+b"))
+    assert swapped == pytest.approx(covariance(WheelMap()))
 
 
 @pytest.mark.parametrize("configured", [100, 400])

@@ -40,7 +40,7 @@ MAX_DIFFERENCE = 0.2  # relative
 
 MIN_COUNTS = 40  # of all wheels in a window: fewer are wrong by their edges
 
-NONE: Motors = (0.0, 0.0, 0.0, 0.0)
+NONE: Wheels4 = (0.0, 0.0, 0.0, 0.0)
 
 # Windows in a row that differ. In one, firmware that filters its speeds may have sped up.
 WRONG_WINDOWS = 2
@@ -101,10 +101,10 @@ class CountsCheck(Struct):
     seconds: float = 0.0
     counted: float = 0.0
     reported: float = 0.0
-    off: Motors = NONE  # by the counts minus by the speeds, rad
-    doubt: Motors | None = None  # `off` of a window that ends with the last line and differs
+    off: Wheels4 = NONE  # by the counts minus by the speeds, rad
+    doubt: Wheels4 | None = None  # `off` of a window that ends with the last line and differs
 
-    def add(self, turned: Motors, speeds: Wheels4, dt: float, count: float) -> None:
+    def add(self, turned: Wheels4, speeds: Wheels4, dt: float, count: float) -> None:
         """Add a line: the angles by its counts, its speeds, and the time by the board's clock."""
         a, b, c, d = turned
         e, f, g, h = speeds

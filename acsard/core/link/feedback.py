@@ -154,15 +154,13 @@ class Timeline(Struct):
         if reading is not None and setup.count:
             by_board = self._turned(setup, reading, came_ns)
             if by_board is not None:
-                check = self.counts_check
+                check, by_counts = self.counts_check, setup.codec.wheels(by_board.motors)
                 if not bridged:
-                    check.add(by_board.motors, speeds.as_tuple(), by_board.dt, setup.count)
+                    check.add(by_counts, speeds.as_tuple(), by_board.dt, setup.count)
                 if check.agrees:
                     dt = since = by_board.dt
-                    bridged, known = 0.0, known and not silent
-                    turned = setup.codec.wheels(by_board.motors)
-                if check.doubt is not None:
-                    doubt, check.doubt = setup.codec.wheels(check.doubt), None
+                    bridged, known, turned = 0.0, known and not silent, by_counts
+                doubt, check.doubt = check.doubt, None
         elif self.encoders.last is not None:
             self.encoders.forget()
         if not known or self.restarted or dt >= MAX_FILLED_GAP_S:
