@@ -11,8 +11,8 @@ step every 10 ms. A second process, the gateway, terminates TLS connections from
 
 `hear` updates the odometry from the feedback, chooses one command and checks that the mode allows
 it. `drive`, in each control period and at once for another speed, limits it and returns the line
-for the board. `sent` says which line really left, and `core/link/output.py` remembers it. No other
-function decides how the robot moves.
+for the board. `sent` says which line really left, and `core/link/link_output.py` remembers it. No
+other function decides how the robot moves.
 
 Where to look: each package may import only the packages below it in this list.
 `pyproject.toml` states this order as contracts, and `lint-imports` checks the contracts.

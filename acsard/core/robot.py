@@ -19,9 +19,9 @@ from acsard.core.config.live import Changes, changed, describe_changes
 from acsard.core.config.parsing import ConfigError
 from acsard.core.config.settings import Config, LimitsConfig
 from acsard.core.link.feedback import Line
+from acsard.core.link.link_output import QUESTION_LINE
 from acsard.core.link.link_setup import LinkSetup
 from acsard.core.link.link_state import WATCHDOG_S
-from acsard.core.link.output import QUESTION_LINE
 from acsard.core.motion.arbiter_text import missed, refused, waiting
 from acsard.core.motion.battery import empty_reason
 from acsard.core.motion.emergency_stop import DRIVER_FAULT_REASON
@@ -140,13 +140,13 @@ class Robot:
     @property
     def applied(self) -> Twist:
         """The twist in the line of `drive`, after all limits; after `sent`, in the last one."""
-        last = self.state.last
-        return (last if last.waits else self.state.out).motion.twist
+        draft = self.state.draft
+        return (draft if draft.waits else self.state.out).motion.twist
 
     @property
     def speeds(self) -> WheelSpeeds:
         """The wheel speeds in the last line of `drive`; zero after a press and without a link."""
-        return self.state.last.speeds
+        return self.state.draft.speeds
 
     @property
     def command_ns(self) -> Ns | None:
@@ -184,7 +184,7 @@ class Robot:
             if now_ns < self._calm_until_ns:
                 return News(estimates) if estimates else QUIET
         answers: tuple[Answer, ...] = ()
-        if heard.requests or state.last.trip or heard.shutting_down:
+        if heard.requests or state.draft.trip or heard.shutting_down:
             answers = self._serve(now, heard, events)
         if heard.speed_cap is not None:
             self._cap_speed(heard.speed_cap, events)
@@ -196,7 +196,7 @@ class Robot:
         if is_chosen:
             self._choose(now_ns)
         mode, status, changed = life.mode, state.status, False
-        urgent = (state.choice.twist, mode) != state.last.made_of
+        urgent = (state.choice.twist, mode) != state.draft.made_of
         if is_chosen or events or answers or mode._value_ != status.mode or mode not in UNLATCHED:
             self._restate(heard.port_trouble)
             changed = state.status is not status
@@ -230,10 +230,10 @@ class Robot:
         """
         state = self.state
         now_ns, twist, limits = now.mono_ns, state.choice.twist, self.config.limits
-        last, out, mode = state.last, state.out, state.life.mode
-        last.made_of, last.made_ns = (state.choice.twist, mode), now_ns
+        draft, out, mode = state.draft, state.out, state.life.mode
+        draft.made_of, draft.made_ns = (state.choice.twist, mode), now_ns
         since = (now_ns - out.made_ns) / NS_PER_S
-        pressed = out.made_ns < last.pressed_ns
+        pressed = out.made_ns < draft.pressed_ns
         if pressed or state.session.link != "up" or since > WRITE_PAUSE_S:
             # The first written line after a press contains zeros, even if the input is already
             # released and the commands that arrived meanwhile may move the robot.
@@ -253,9 +253,9 @@ class Robot:
         else:
             motion = coast(out.motion, since, limits, stop=mode in HALTED)
             speeds = self.model.kinematics.wheel_speeds(motion.twist)
-        last.motion, last.speeds = motion, speeds
+        draft.motion, draft.speeds = motion, speeds
         line = state.session.line(self.link_setup, out, now_ns, speeds)
-        last.waits = line is not None
+        draft.waits = line is not None
         return line
 
     def sent(self, at_ns: Ns, line: bytes | None, trip: Trip = "") -> None:
@@ -263,24 +263,24 @@ class Robot:
 
         `trip` says why the guard replaced it with the stop line.
         """
-        state, last, session = self.state, self.state.last, self.state.session
-        last.waits, last.trip = False, trip
+        state, draft, session = self.state, self.state.draft, self.state.session
+        draft.waits, draft.trip = False, trip
         if trip or line is None:
             self._calm_until_ns = 0
         if line is None:
             closed = session.link == "down"
-            state.out.dropped(last.made_ns, closed=closed, trip=bool(trip))
+            state.out.dropped(draft.made_ns, closed=closed, trip=bool(trip))
             if not closed:
                 state.count("lines_superseded")
             return
         state.count("lines_sent")
-        motion, speeds = (AT_REST, STILL) if trip else (last.motion, last.speeds)
-        silent, is_robots = session.silent(last.made_ns), not trip
+        motion, speeds = (AT_REST, STILL) if trip else (draft.motion, draft.speeds)
+        silent, is_robots = session.silent(draft.made_ns), not trip
         state.out.wrote(
             self.link_setup,
             line,
             at_ns,
-            last.made_ns,
+            draft.made_ns,
             motion,
             speeds,
             silent=silent,
@@ -369,7 +369,7 @@ class Robot:
         if estop.pressed_now is not None or bumpers.pressed_now is not None:
             # Do not ramp: the hardware has cut the motors, or the robot touches an obstacle.
             state.cut()
-            state.last.made_of, state.last.pressed_ns = None, now_ns
+            state.draft.made_of, state.draft.pressed_ns = None, now_ns
         if estop.driver_fault:
             self._fault(DRIVER_FAULT_REASON, now, events)
             life.freed_ns = now_ns
@@ -445,7 +445,7 @@ class Robot:
 
     def _serve(self, now: Instant, heard: Heard, events: list[Event]) -> tuple[Answer, ...]:
         state = self.state
-        trip, state.last.trip = state.last.trip, ""
+        trip, state.draft.trip = state.draft.trip, ""
         if trip:
             self._fault(reason(trip), now, events)
             state.life.freed_ns = now.mono_ns
@@ -558,7 +558,7 @@ class Robot:
     def _fault(self, why: Reason, now: Instant, events: list[Event]) -> None:
         state = self.state
         if state.life.fault(why, now):
-            state.arbiter.require_neutral(state.last.made_ns)
+            state.arbiter.require_neutral(state.draft.made_ns)
             text = f"{why.text}; `acsard call clear` releases it"
             events.append(Event("fault", text, "error", code=why.code))
 

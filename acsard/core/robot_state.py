@@ -11,24 +11,49 @@ from msgspec import Struct, field
 from acsard.core.board_inputs import BoardInputs, inputs_after
 from acsard.core.config.settings import Config
 from acsard.core.link.link_diagnosis import UnansweredLines
-from acsard.core.link.output import Output
+from acsard.core.link.link_output import Output
 from acsard.core.link.session import McuSession
 from acsard.core.motion.arbiter import Arbiter, Choice
 from acsard.core.motion.arbiter_text import CommandEvents
 from acsard.core.motion.consistency import ConsistencyChecks
 from acsard.core.motion.event_throttle import EventThrottle
-from acsard.core.motion.last_line import LastLine
 from acsard.core.motion.lifecycle import Lifecycle
+from acsard.core.motion.modes import Mode
 from acsard.core.motion.odometry import Odometry
 from acsard.core.motion.sanity import Sanity
 from acsard.core.motion.uncertainty import ErrorModel
-from acsard.core.values import AT_REST, STILL, Event, Latches, Ns, SpeedCap, Status
+from acsard.core.values import (
+    AT_REST,
+    STILL,
+    Event,
+    Latches,
+    Motion,
+    Ns,
+    SpeedCap,
+    Status,
+    Trip,
+    Twist,
+    WheelSpeeds,
+)
+
+
+class Draft(Struct):
+    """The line that `drive` made last, which may not have left, and why the next one is due."""
+
+    motion: Motion = AT_REST
+    speeds: WheelSpeeds = STILL  # zero after a press and without a link
+    made_ns: Ns = 0
+    # The twist to follow and the mode of the last line. None after a press: a new line is due.
+    made_of: tuple[Twist | None, Mode] | None = None
+    waits: bool = False  # for `sent`
+    trip: Trip = ""  # why the guard replaced the line, until the robot has latched the fault
+    pressed_ns: Ns = 0  # last press of the emergency stop or a bumper
 
 
 class State(Struct):
     life: Lifecycle
     command_events: CommandEvents
-    last: LastLine
+    draft: Draft
     inputs: BoardInputs
     odometry: Odometry
     out: Output = field(default_factory=Output)
@@ -56,7 +81,7 @@ class State(Struct):
 
     def cut(self) -> None:
         """Set the speed to zero without a ramp: the motors have stopped."""
-        self.last.speeds, self.out.motion = STILL, AT_REST
+        self.draft.speeds, self.out.motion = STILL, AT_REST
 
 
 def initial(latches: Latches, config: Config, model: ErrorModel) -> State:
@@ -65,7 +90,7 @@ def initial(latches: Latches, config: Config, model: ErrorModel) -> State:
     state = State(
         life,
         CommandEvents(life.mode),
-        LastLine(made_of=(None, life.mode)),
+        Draft(made_of=(None, life.mode)),
         inputs_after(latches, config),
         Odometry.initial(model),
     )

@@ -270,9 +270,9 @@ FAULTS = (
     fault("robot waits", "`state` names no source whose commands are late or not proved yet",
           ARBITER, "return self._refused(settings, now_ns) or COMMAND", "return COMMAND"),
     fault("robot unsent", "a line that never left counts as obeyed", ROBOT,
-          "        last.waits, last.trip = False, trip\n",
-          "        last.waits, last.trip = False, trip\n"
-          "        line = line or self.link_setup.codec.encode(last.speeds)\n"),
+          "        draft.waits, draft.trip = False, trip\n",
+          "        draft.waits, draft.trip = False, trip\n"
+          "        line = line or self.link_setup.codec.encode(draft.speeds)\n"),
     # session
     fault("session quiet", "a silent board gets lines that move it for a second",
           "core/link/link_setup.py", "NS_PER_S * max(0.1, 4 / rate_hz",
@@ -390,8 +390,8 @@ FAULTS = (
         "        p = PoseCovariance(*(100.0 * getattr(p, name) for name in p.__struct_fields__))\n"
         "        self.covariance = p if known else UNKNOWN_POSE\n"),
     fault("odometry silent", "the pose goes on at 0.1 m/s while the board is silent", ROBOT,
-          "        pressed = out.made_ns < last.pressed_ns\n",
-          "        pressed = out.made_ns < last.pressed_ns\n"
+          "        pressed = out.made_ns < draft.pressed_ns\n",
+          "        pressed = out.made_ns < draft.pressed_ns\n"
           '        if state.session.link != "up" and state.session.good_lines:\n'
           "            pose = state.odometry.pose\n"
           "            state.odometry.pose = replace(pose, x=pose.x + 0.001)\n"),
@@ -422,7 +422,7 @@ FAULTS = (
           "self.pose = Pose(pose.x + dx, pose.y + dy, yaw)",
           "self.pose = Pose(math.remainder(pose.x + dx, 2.0), pose.y + dy, yaw)"),
     fault("answers twice", "replies that arrive twice never let the link come up",
-          "core/link/output.py", "again = reply.sequence in self.answered", "again = False",
+          "core/link/link_output.py", "again = reply.sequence in self.answered", "again = False",
           Edit("core/link/link_state.py", "CHECKED_LINES = 3, 1", "CHECKED_LINES = 3, 2")),
     fault("wheel stuck", "a wheel that seems not to turn is neither left out nor named",
           "core/motion/sides.py", "OUT_BLOCKS = 2\n", "OUT_BLOCKS = 1_000_000\n",

@@ -18,8 +18,8 @@ from msgspec import Struct
 
 from acsard.core.config.settings import McuConfig
 from acsard.core.link.feedback import Line
+from acsard.core.link.link_output import QUESTION_LINE, Output
 from acsard.core.link.link_setup import LinkSetup
-from acsard.core.link.output import QUESTION_LINE, Output
 from acsard.core.link.session import McuSession
 from acsard.core.values import AT_REST, NS_PER_S, Instant, Pose, Received, WheelSpeeds
 from tests.unit.odometer import Odometer, arc

@@ -6,9 +6,9 @@ from acsard.core.codes import Reason
 from acsard.core.config.settings import McuConfig
 from acsard.core.link.checked_line import seal
 from acsard.core.link.feedback import Line
+from acsard.core.link.link_output import QUESTION_LINE, Output
 from acsard.core.link.link_setup import LinkSetup
 from acsard.core.link.link_state import GOOD_LINES
-from acsard.core.link.output import QUESTION_LINE, Output
 from acsard.core.link.session import McuSession
 from acsard.core.values import AT_REST, NS_PER_S, Instant, Received, WheelSpeeds
 from tests.vectors.lines import SEED_LINE, ZERO

@@ -7,9 +7,9 @@ from msgspec.structs import replace
 from acsard.core.config.settings import FeedbackConfig, McuConfig
 from acsard.core.config.wire_time import wire_ns
 from acsard.core.link.feedback import MIN_INTERVAL_NS
+from acsard.core.link.link_output import Output
 from acsard.core.link.link_setup import LinkSetup
 from acsard.core.link.link_state import Link
-from acsard.core.link.output import Output
 from acsard.core.link.session import LONG_GAP_NS, McuSession
 from acsard.core.values import NS_PER_S, Instant, Received, WheelSpeeds
 from tests.each import each

@@ -11,8 +11,8 @@ import pytest
 from acsard.core.config.settings import FeedbackConfig, McuConfig, WheelMap
 from acsard.core.link.checked_line import Reading
 from acsard.core.link.feedback import Line, Timeline
+from acsard.core.link.link_output import Output
 from acsard.core.link.link_setup import LinkSetup
-from acsard.core.link.output import Output
 from acsard.core.values import AT_REST, Instant, WheelSpeeds
 from tests.each import each
 

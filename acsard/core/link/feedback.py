@@ -14,8 +14,8 @@ from acsard.core.link.board_counts import CountsCheck, Encoders, Turned
 from acsard.core.link.checked_line import Reading
 from acsard.core.link.coarse_encoders import CoarseEncoders
 from acsard.core.link.line_times import FreeRunning, Prompted
+from acsard.core.link.link_output import Output
 from acsard.core.link.link_setup import LinkSetup
-from acsard.core.link.output import Output
 from acsard.core.link.whole_counts import WholeCounts
 from acsard.core.values import NS_PER_S, Instant, Ns, Rad, RadPerS, Seconds, Wheels4, WheelSpeeds
 

@@ -15,7 +15,7 @@ import math
 
 from msgspec import Struct, field
 
-from acsard.core.link.output import Output
+from acsard.core.link.link_output import Output
 from acsard.core.values import NS_PER_S, Ns
 
 MAX_CLOCK_ERROR = 0.01  # relative; a ceramic resonator reaches half of it

@@ -20,9 +20,9 @@ from acsard.core.link.echo_check import QUESTION, WINDOW_NS, EchoCheck
 from acsard.core.link.feedback import Line, Timeline
 from acsard.core.link.lines import LineReader
 from acsard.core.link.link_diagnosis import SilenceDiagnosis
+from acsard.core.link.link_output import QUESTION_LINE, Output
 from acsard.core.link.link_setup import LinkSetup
 from acsard.core.link.link_state import GOOD_LINES, WATCHDOG_NS, WATCHDOG_S, Link, LinkState
-from acsard.core.link.output import QUESTION_LINE, Output
 from acsard.core.link.pose_warning import PoseWarning
 from acsard.core.link.step_times import StepTimes
 from acsard.core.link.whole_counts import MAX_MISFIT
