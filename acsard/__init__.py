@@ -47,7 +47,7 @@ Inside `core/`, in the same order:
     core/simulator/  the vehicle, the simulated microcontroller and its faults
     core/summary.py  what `state` and `diagnostics` say about a robot
     core/robot.py    hear, drive and sent; core/guard.py checks each outgoing line
-    core/robot_state.py  all that the robot knows between two steps; a recording stores it as it is
+    core/robot_memory.py  all that the robot knows between two steps; a recording stores it as it is
     core/reasons.py  the text in `reason`
     core/board_inputs.py  emergency stop, bumpers and battery, as the board reports them
     core/incoming/   input from the bus: turns samples into commands, and answers queries

@@ -31,7 +31,7 @@ from acsard.core.motion.modes import Mode, RefusedError
 from acsard.core.motion.uncertainty import ErrorModel
 from acsard.core.motion.wheels import LEAST_SPEED
 from acsard.core.reasons import reason_of
-from acsard.core.robot_state import State, initial
+from acsard.core.robot_memory import State, initial
 from acsard.core.values import (
     AT_REST,
     NS_PER_S,
@@ -108,7 +108,7 @@ class Robot:
         self.state = state or initial(latches, config, self.model)
         # Motion, twist, limits and cap with which the motion does not change; its wheel speeds.
         self._steady: tuple[tuple[Motion, Twist, LimitsConfig, float] | None, WheelSpeeds]
-        self._steady = (None, STILL)
+        self._steady = (None, STILL)  # as the two below, a cache: the next step makes it again
         # Until then, a step decides nothing if it brings only lines; 0: not even now.
         self._calm_until_ns: Ns = 0
         self._nothing = Heard(True)  # what `hear` gets if nothing arrives
@@ -162,7 +162,7 @@ class Robot:
         """Process what arrived since the last call, and return what is to be published."""
         state, now_ns = self.state, now.mono_ns
         life, arbiter, steps = state.life, state.arbiter, state.session.steps
-        before_ns = steps.begin(now_ns)
+        before_ns = steps.begin(self.link_setup, now_ns)
         calm = steps.is_steady and now_ns < self._calm_until_ns
         if calm and heard == self._nothing:
             return QUIET

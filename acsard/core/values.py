@@ -450,7 +450,7 @@ class Status(Struct, frozen=True):
 class News(Struct, frozen=True):
     """What the robot makes of what it heard.
 
-    - urgent: the board should get a new line at once, for a new command or mode, or because an
+    - urgent: the board should get a new line at once, for another speed or mode, or because an
       input was pressed.
     - status_changed: there is another `Robot.status`.
     """

@@ -68,6 +68,7 @@ class ControlLoop:
         self.pace = Pace(wire_ns(mcu.line_bytes, mcu.baud_rate), robot.config.period_ns)
         self._start_ns, self._mono_ns = start.mono_ns, mono_ns
         self._look_ns = start.mono_ns
+        self._changed = False  # another speed or mode is in no written line yet
         if recorder is not None and robot.latches != Latches():
             # Without this record, a replay would start with a robot that has no latches.
             recorder.begins(robot, self._guard)
@@ -99,6 +100,7 @@ class ControlLoop:
                 tick = pace.period_ended(heard.missed)
             news = robot.hear(now, heard)
             due = tick
+            self._changed = self._changed or news.urgent
             if news is not QUIET:
                 if heard.requests:
                     port.release(robot.port_released)
@@ -108,7 +110,7 @@ class ControlLoop:
             if due:
                 line = robot.drive(now)
                 if line is not None:
-                    written = self._write(line, now, news.urgent)
+                    written = self._write(line, now)
         except Exception:
             # Store the stops that this wake-up has taken from the bus. The exception may have come
             # before the robot processed them.
@@ -160,7 +162,7 @@ class ControlLoop:
             self.shutting_down,
         )
 
-    def _write(self, line: bytes, now: Instant, urgent: bool) -> Written:
+    def _write(self, line: bytes, now: Instant) -> Written:
         # The guard may replace the line, and the port may drop it.
         robot, port, guard = self.robot, self._port, self._guard
         status, command_ns = robot.status, robot.command_ns
@@ -173,8 +175,9 @@ class ControlLoop:
             robot.sent(now.mono_ns, None, trip)
             return None, trip, 0
         guard.record_written(line)
+        changed, self._changed = self._changed, False
         if status.mode == "driving":
-            self.publication.stopwatch.line(command_ns, port.sent_ns, before_ns, urgent)
+            self.publication.stopwatch.line(command_ns, port.sent_ns, before_ns, changed)
         late_ns = port.sent_ns - now.mono_ns
         late_ns = late_ns if late_ns >= MIN_WRITE_DELAY_NS else 0
         robot.sent(now.mono_ns + late_ns, line, trip)

@@ -166,15 +166,15 @@ class Stopwatch:
             self._turn_ns = now_ns + TURN_NS
             next(self._turns).sort(now_ns)  # takes about 40 us
 
-    def line(self, command_ns: Ns | None, sent_ns: Ns, before_ns: Ns, urgent: bool) -> None:
+    def line(self, command_ns: Ns | None, sent_ns: Ns, before_ns: Ns, changed: bool) -> None:
         """Record how old the command in a line was when it was written, while the robot drives.
 
-        `urgent`: the command or the mode is another one than in the line at `before_ns`.
+        `changed`: the speed to follow or the mode is another one than in the line at `before_ns`.
         """
         if command_ns is None:
             return
         self.figures["command_age"].add(sent_ns - command_ns)
         # A command that is older than the previous line was in that line already, or it had to wait
         # until its source was chosen.
-        if urgent and command_ns > before_ns:
+        if changed and command_ns > before_ns:
             self.figures["command_to_wire"].add(sent_ns - command_ns)

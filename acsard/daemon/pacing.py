@@ -1,6 +1,6 @@
 """Decides when a line may be written to the board: in every control period, and early if needed.
 
-An early line is for a new command or mode, or after a press of the emergency stop or a bumper. It
+An early line is for another speed or mode, or after a press of the emergency stop or a bumper. It
 replaces the next period's, so a flood of commands causes no more lines. It comes after the wire
 time of a line plus `REPLY_TIME_NS`, and only one is tried in a period.
 """
@@ -25,7 +25,7 @@ NO_PERIOD = Period(0, 0)
 # Least time from the end of a line to an early one, in which the board can reply.
 REPLY_TIME_NS = 1_000_000
 
-# Steps in a period whose input brings no new command or mode. Further input waits for the next
+# Steps in a period whose input brings no other speed or mode. Further input waits for the next
 # period, so a flood takes little processor time.
 MAX_IDLE_WAKES = 3
 

@@ -18,7 +18,7 @@ from acsard.core.config.settings import Config
 from acsard.core.formatting import printable
 from acsard.core.guard import Memory
 from acsard.core.robot import Robot
-from acsard.core.robot_state import State
+from acsard.core.robot_memory import State
 from acsard.core.values import AcsardError
 
 MAX_BYTES = 1 << 20  # usually 8 000 to 30 000, more with many senders
@@ -31,7 +31,7 @@ class StateError(AcsardError):
 
 
 class LayoutError(StateError):
-    """The parts of the recorded robot are other ones than in this version of acsard."""
+    """The recorded state has other fields than in this version of acsard."""
 
 
 class Restored(NamedTuple):

@@ -190,6 +190,17 @@ def test_the_reported_latencies_of_a_command_are_the_real_ones(world: World) -> 
     assert figures["period_lateness"].since_start.max == 0.0
 
 
+def test_the_wait_of_a_command_includes_the_lines_that_could_not_leave(world: World) -> None:
+    world.hold(0.3, seconds=0.5)
+    between_ticks(world, 6.0)
+    world.port.blocked = True
+    world.send(0.5)
+    world.run(0.020)
+    world.port.blocked = False
+    world.run(1.1)
+    assert world.state.latencies["command_to_wire"].since_start.max >= 20_000.0
+
+
 def test_checked_replies_give_the_round_trip_time_of_the_microcontroller() -> None:
     world = World(Config(mcu=McuConfig(link_check="on")))
     world.run(1.0)

@@ -215,7 +215,7 @@ class Host:
                 self._update(now, (Received(now, data[start : start + PIECE]),))
 
     def _update(self, now: Instant, received: tuple[Received, ...]) -> None:
-        self.session.steps.begin(now.mono_ns)
+        self.session.steps.begin(self.setup, now.mono_ns)
         for feedback in self.session.update(self.setup, self.out, now, True, 1, received):
             self.heard.append(feedback)
             self.found.fold(feedback)

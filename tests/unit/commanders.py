@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 
-from acsard.core.config.settings import CommandsConfig, Source
+from acsard.core.config.settings import CommandsConfig, McuConfig, Source
+from acsard.core.link.link_setup import LinkSetup
 from acsard.core.link.step_times import StepTimes
 from acsard.core.motion.arbiter import Arbiter, Choice
 from acsard.core.values import NS_PER_S, REST, Command, SourceStatus, Twist
@@ -32,9 +33,12 @@ SOURCES = (
 )
 
 
+SETUP = LinkSetup.of(McuConfig(), 100.0)
+
+
 def begin(arbiter: Arbiter, steps: StepTimes, now_ns: int, commands: CommandsConfig) -> None:
     """Begin a step, as the robot does."""
-    before_ns = steps.begin(now_ns)
+    before_ns = steps.begin(SETUP, now_ns)
     if before_ns is None:
         arbiter.start(now_ns)
     elif steps.is_late:

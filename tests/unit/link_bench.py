@@ -65,7 +65,7 @@ class LinkBench:
         received = tuple(Received(self.now, data) for data in reads)
         if self.made is not None:
             self._report(self.made, left)
-        self.session.steps.begin(self.now_ns)
+        self.session.steps.begin(self.setup, self.now_ns)
         return self.session.update(
             self.setup, self.out, self.now, self.port_open, self.opened, received
         )

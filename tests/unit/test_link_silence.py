@@ -139,11 +139,11 @@ def after(*steps_ms: int, good: bool = False) -> StepTimes:
     `good` says whether another good line arrives in the last step.
     """
     steps, now_ns = StepTimes(0), 0
-    steps.excuses_silence(REAL, good=True)
+    steps.end_silence(REAL, good=True)
     for number, step_ms in enumerate(steps_ms, 1):
         now_ns += step_ms * MS
-        steps.begin(now_ns)
-        steps.excuses_silence(REAL, good=good and number == len(steps_ms))
+        steps.begin(REAL, now_ns)
+        steps.end_silence(REAL, good=good and number == len(steps_ms))
     return steps
 
 

@@ -18,7 +18,7 @@ from msgspec.structs import replace
 from acsard.core.config.settings import Config
 from acsard.core.guard import Memory
 from acsard.core.robot import Robot
-from acsard.core.robot_state import State
+from acsard.core.robot_memory import State
 from acsard.core.summary import summary
 from acsard.recording.file import Recording
 from acsard.recording.replay import Playback

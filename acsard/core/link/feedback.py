@@ -54,6 +54,11 @@ class Line(Struct, frozen=True, gc=False):
     asked_ns: Ns | None = None  # when the answered command was written
     heard_ns: Ns = 0  # the host had the complete line
 
+    @property
+    def by_counts(self) -> Wheels4 | None:
+        """The angle of each wheel since the previous line, if the line shows counts."""
+        return self.counted if self.turned is None else self.turned
+
 
 class Timeline(Struct):
     """Assigns a sample time to each good line, in order.

@@ -1,8 +1,9 @@
-"""Remembers what left the daemon for the board. Beside the guard's own memory, it is the only one.
+"""Remembers what left the daemon for the board, and when.
 
 `Robot.sent` calls `wrote` for a line that left and `dropped` for one that did not; nothing else
-does. The question of `echo_check.py` moves nothing and is no line here: it changes only the time of
-the last bytes. A line is open until its reply comes, or until it is given up.
+does. The question of `echo_check.py` moves nothing and is no line here, but its bytes left. A line
+is open until its reply comes, or until it is given up. The guard has a memory of its own, because
+it shares no code with what it checks, and the port knows until when the wire is busy.
 """
 
 from __future__ import annotations

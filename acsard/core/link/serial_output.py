@@ -20,7 +20,9 @@ class Port(Protocol):
     opened: int  # how often
     trouble: str  # why the port is closed, in words
 
-    sent_ns: Ns  # when the kernel last accepted bytes, 0 since the port was opened
+    @property
+    def sent_ns(self) -> Ns:
+        """When the kernel last accepted bytes, 0 since the port was opened."""
 
     def take(self, late: Instant | None = None) -> tuple[Received, ...]:
         """Return the bytes since the last call; in a `late` step, those in the kernel, too."""

@@ -133,7 +133,7 @@ class McuSession(Struct):
                     self._reject("too_long", more=more)
                     link.bad(setup.checked)
             steps = self.steps
-            if steps.excuses_silence(setup, good=bool(feedback)):
+            if steps.end_silence(setup, good=bool(feedback)):
                 link.reset_silences()
             if (
                 steps.step_s

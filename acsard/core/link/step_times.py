@@ -27,10 +27,11 @@ class StepTimes(Struct):
     step_s: Seconds = 0.0  # the same, if lines may be missing for it
     late_s: Seconds = 0.0  # largest `step_s` since the last good line
 
-    def begin(self, now_ns: Ns) -> Ns | None:
+    def begin(self, setup: LinkSetup, now_ns: Ns) -> Ns | None:
         """Begin a step, and return when the one before began."""
         before_ns, self.at_ns = self.at_ns, now_ns
-        self.passed_ns = 0 if before_ns is None else now_ns - before_ns
+        passed_ns = self.passed_ns = 0 if before_ns is None else now_ns - before_ns
+        self.step_s = passed_ns / NS_PER_S if passed_ns >= setup.late_step_ns else 0.0
         return before_ns
 
     @property
@@ -41,14 +42,12 @@ class StepTimes(Struct):
     def is_late(self) -> bool:
         return self.passed_ns > LATE_NS
 
-    def excuses_silence(self, setup: LinkSetup, good: bool) -> bool:
-        """Return whether this step ends a silence of the board that this computer caused.
+    def end_silence(self, setup: LinkSetup, good: bool) -> bool:
+        """Record whether a good line came; return whether it ends a silence of this computer.
 
-        Only a good line ends one. The built-in simulator runs on this computer, so with it the
-        result is True for every good line.
+        The built-in simulator runs on this computer, so with it the result is True for every good
+        line.
         """
-        late = self.passed_ns >= setup.late_step_ns
-        self.step_s = self.passed_ns / NS_PER_S if late else 0.0
         late_s = max(self.late_s, self.step_s)
         self.late_s = 0.0 if good else late_s
         return good and (late_s > 0.0 or setup.mcu.simulated)

@@ -52,7 +52,7 @@ def rolled_over(skipped: Skipped, line: Line, before: Wheels4) -> Rolled:
         seconds, filled, unknown, angles = line.dt, 0.0, 0.0, line.turned
     else:
         seconds, filled, unknown = line.dt - line.bridged, line.bridged, line.gap
-        angles = times(speeds, seconds) if line.counted is None else line.counted
+        angles = line.by_counts or times(speeds, seconds)
     if skipped.lines:
         angles = plus(skipped.turned, angles)
         seconds, filled = seconds + skipped.counted, filled + skipped.lost

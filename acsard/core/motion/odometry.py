@@ -83,7 +83,7 @@ class Odometry(Struct):
             gap, self.skipped = rolled_over(self.skipped, line, self.speeds.as_tuple()), Skipped()
             rolled, seconds = gap.angles, gap.seconds
         else:
-            rolled = line.turned or line.counted or times(reported, seconds)
+            rolled = line.by_counts or times(reported, seconds)
         # Counts are valid even after a silence: the wheels turned by them in its time, too.
         whole = seconds if line.turned is None else seconds + line.gap
         checks.check_line(model, line, rolled, whole, known=gap is None or not gap.unknown)

@@ -140,7 +140,7 @@ class Sanity(Struct):
         )
 
     def _too_fast(self, line: Line, fastest: RadPerS) -> str:
-        turned, own = _proven(line), line.dt - line.bridged
+        turned, own = line.by_counts, line.dt - line.bridged
         usual = max(own, MIN_COUNT_S)
         known = line.step < math.inf
         # The pose fills the time of the impossible lines before this one with its speeds.
@@ -164,7 +164,7 @@ class Sanity(Struct):
         return ""
 
     def _jump(self, line: Line, before: WheelSpeeds, most: float) -> str:
-        least = line.count / MIN_INTERVAL_S if _proven(line) is not None else 0.0
+        least = line.count / MIN_INTERVAL_S if line.by_counts is not None else 0.0
         most += COUNT_MARGIN * max(line.step, least)
         rows = zip(WHEELS, line.speeds.as_tuple(), before.as_tuple(), strict=True)
         for name, now, then in rows:
@@ -172,7 +172,3 @@ class Sanity(Struct):
                 leap = f"{name} jumps from {then:.2f} to {now:.2f} rad/s"
                 return f"{leap}, which is over {MAX_WHEEL_ACCELERATION:g} rad/s2"
         return ""
-
-
-def _proven(line: Line) -> Wheels4 | None:
-    return line.counted if line.turned is None else line.turned

@@ -52,7 +52,7 @@ class SerialPort(Port, asyncio.Protocol):
         asleep: SuspendDetector | None = None,
     ) -> None:
         # `stop` is zeros for all wheels. `wake` gets the time of data and of the loss of the port.
-        self.is_open, self.sent_ns = False, 0
+        self.is_open = False
         self._asleep = asleep or SuspendDetector()
         self.opened = 0
         self._path, self._baud_rate, self._stop = path, baud_rate, stop
@@ -108,9 +108,11 @@ class SerialPort(Port, asyncio.Protocol):
             self._leave(error)
             return "down"
         # The wire is busy from the moment of the write, not from the start of the step.
-        offered = self._output.record_write(line, data, byte_count, clock.mono_ns())
-        self.sent_ns = self._output.sent_ns
-        return offered
+        return self._output.record_write(line, data, byte_count, clock.mono_ns())
+
+    @property
+    def sent_ns(self) -> Ns:
+        return self._output.sent_ns
 
     def release(self, released: bool) -> None:
         if released is not self._ours.is_set():
@@ -181,7 +183,7 @@ class SerialPort(Port, asyncio.Protocol):
             device.close()
             raise OSError(errno.EBUSY, "the port was released meanwhile")
         self._lost.clear()
-        self._output, self.sent_ns = SerialOutput(baud_rate, self._stop, self._period_ns), 0
+        self._output = SerialOutput(baud_rate, self._stop, self._period_ns)
         self._received.clear()
         loop = asyncio.get_running_loop()
         self._transport, _ = await connection_for_serial(loop, lambda: self, device)
