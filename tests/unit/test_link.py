@@ -237,10 +237,24 @@ def test_a_board_that_repeats_commands_but_not_the_question_has_no_encoders(enco
     bench.setup = LinkSetup.of(PLAIN, 100.0, FeedbackConfig(encoders=encoders))
     bench.up()
     for n in range(400):
-        line = bench.line(WheelSpeeds(*[n % 100 / 10] * 4))
+        line = bench.line(WheelSpeeds(*[min(n % 100, 50) / 10] * 4))
         assert line is not None
         bench.wait(10, *([] if line == b"?\r\n" else [line]))
         if bench.link != "up":
             break
     assert bench.link == ("stale" if encoders else "up")
     assert not encoders or (bench.why.code == "set_points" and 150 < n < 300)
+
+
+def test_an_ideal_motor_lags_by_one_line_in_a_long_ramp_but_not_at_its_ends() -> None:
+    bench = LinkBench().up()
+    before = 0.0
+    for n in range(800):
+        speed = min(n % 400, 250) / 20
+        line = bench.line(WheelSpeeds(*[speed] * 4))
+        assert line is not None
+        late = 0.02 if n % 400 in (1, 2, 251, 252) else 0.0
+        reply = bench.setup.codec.encode(WheelSpeeds(*[max(0.0, before - late)] * 4))
+        bench.wait(10, *([] if line == b"?\r\n" else [reply]))
+        assert bench.link == "up"
+        before = speed

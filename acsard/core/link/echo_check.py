@@ -4,7 +4,9 @@ TX and RX are joined, or the board reports its commands: equal bytes cannot tell
 the question. The daemon sends `QUESTION` after the first line of a session, and when the lines of
 half a second were lines that it had sent. An echo returns it, and a board answers with its name or
 not at all. At rest every board repeats the line of zeros, so a link that is up is asked only if the
-repeated speeds changed, or once when the lines of a steady drive begin to be repeated.
+repeated speeds changed, or once when the lines of a steady drive begin to be repeated. A board has
+no encoders if it repeats the begins and ends of ramps, too: in a steady ramp, the lag of an ideal
+motor is that of a line.
 """
 
 from __future__ import annotations
@@ -26,8 +28,7 @@ WINDOW_NS = NS_PER_S // 2
 # Of the written lines that return: an echo beside a board's replies, of which some get lost.
 RETURNED_FRACTION = 0.9
 
-# In a row, in which a board without encoders repeats the commands: two may lie in a steady ramp of
-# an ideal motor.
+# In a row, in which a board without encoders repeats the begin or the end of a ramp.
 SET_POINT_WINDOWS = 3
 
 _SPEEDS = 31  # bytes of a line without its checksum
@@ -44,7 +45,7 @@ class EchoCheck(Struct):
     asked_ns: Ns | None = None
     named_ns: Ns | None = None  # a board has last sent its name since the question
     speeds: bytes = b""  # of the last repeated line
-    windows: int = 0  # in a row, of repeated lines with other speeds
+    windows: int = 0  # in a row, of repeated lines with a turn
     steady: bool = False  # the last window had repeated lines of a moving robot
     # The window: its begin, the number of lines that were written before it, and the lines in it.
     since_ns: Ns = 0
@@ -52,6 +53,8 @@ class EchoCheck(Struct):
     lines: int = 0  # received
     repeated: int = 0
     changes: int = 0  # of their speeds
+    turns: int = 0  # from equal speeds to other ones, or back, in lines that follow each other
+    last: Literal["", "equal", "other"] = ""  # the speed of the last line, if it was repeated
 
     def restart(self) -> None:
         """Ask again after the next line, because a new session begins."""
@@ -59,7 +62,7 @@ class EchoCheck(Struct):
 
     def _begin(self, now_ns: Ns, written: int) -> None:
         self.since_ns, self.written = now_ns, written
-        self.lines = self.repeated = self.changes = 0
+        self.lines = self.repeated = self.changes = self.turns = 0
 
     def asks(self, at_ns: Ns) -> None:
         """Record that `QUESTION` was written."""
@@ -70,10 +73,14 @@ class EchoCheck(Struct):
         if not self.asked:
             self.due = True  # not before: a board that boots would not get it
         self.lines += 1
+        before, self.last = self.last, ""
         if line + b"\r\n" in written:
             self.repeated += 1
             speeds, self.speeds = self.speeds, line[:_SPEEDS]
-            self.changes += bool(speeds) and speeds != self.speeds
+            changed = bool(speeds) and speeds != self.speeds
+            self.changes += changed
+            self.last = "other" if changed else "equal"
+            self.turns += before not in ("", self.last)
 
     def returned(self, at_ns: Ns) -> None:
         """Record that `QUESTION` was received."""
@@ -101,14 +108,14 @@ class EchoCheck(Struct):
         `feedback.encoders`.
         """
         least = min(self.lines, RETURNED_FRACTION * (written - self.written))
-        changes = self.changes
+        changes, turns = self.changes, self.turns
         suspect = 0 < least <= self.repeated
         self._begin(now_ns, written)
         known, self.steady = self.steady, suspect and bool(self.speeds.strip(_NO_SPEED))
         if not suspect:
             self.windows = 0
             return
-        self.windows += changes > 0
+        self.windows += turns > 0
         if self.trouble or (moving and not changes and (known or not self.steady)):
             return
         if self.windows < SET_POINT_WINDOWS or self.asked_ns is None:
