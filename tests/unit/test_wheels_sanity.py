@@ -22,11 +22,15 @@ def only(wheel: int, speed: float, others: float = 0.0) -> WheelSpeeds:
 
 
 def line(speed: float, wheel: int = 1, others: float = 0.0, **more: Any) -> Line:
-    """Return a line with the speed of one wheel; `step` is that of all encoders."""
+    """Return a line with the speed of one wheel; `step` is that of all encoders.
+
+    3200 counts a turn are declared, unless `count` is 0 or the step unknown.
+    """
     speeds, step, dt = only(wheel, speed, others), more.pop("step", 0.0), more.pop("dt", 0.01)
     if more.pop("proven", False):  # the line has whole counts
         more |= {"counted": tuple(dt * each for each in speeds.as_tuple()), "count": step * dt}
-    return Line(Instant(0, 0), speeds, dt, step=step, **more)
+    count = more.pop("count", 0.0 if step == UNKNOWN else math.tau / 3200)
+    return Line(Instant(0, 0), speeds, dt, count=count, step=step, **more)
 
 
 def lines(*speeds: float, **more: Any) -> list[Line]:
@@ -103,6 +107,10 @@ ROWS: dict[str, Row] = {
     "one count of 16 in 4 ms": (
         80, 1500, lines(98.17, 98.17, 0, 98.17, dt=0.00333, step=98.17), "....",
     ),
+    # Fine encoders without declared counts: no more than a motor's own changes, as 17 in 10 ms, but
+    # up to one count of 200 above the limit.
+    "undeclared, a damaged line": (80, 1500, lines(8, 8, 28, 8, count=0.0), "..x."),
+    "undeclared, one count of 200": (10, 1500, lines(13.1, 9, 13.2, count=0.0), "..x"),
     "unknown, but over the limit": (80, 1500, lines(0, 84.9, 85.1, step=UNKNOWN), "..x"),
     "unknown, from the first line": (80, 1500, lines(99, 99, 99, step=UNKNOWN), "xxF"),
     # One count of 16 in 10 ms is 39.27 rad/s; 39.3 are allowed, because lines have rounded speeds.

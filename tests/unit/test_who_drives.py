@@ -265,3 +265,14 @@ def test_a_refusal_is_an_event_with_its_reason_and_its_sender() -> None:
     event = refused(Refusal("unproven", "new", "app", "joe"))
     assert event == Event("new_sender", "new", "debug", "joe", news=False, code="unproven")
     assert missed(3, 10 * MS).count == 3
+
+
+def test_a_repeated_command_from_before_a_late_step_keeps_no_choice_that_the_stall_made() -> None:
+    """The command came during the stall, and is read one step later than the others."""
+    one = Commanders().play("wake; 50 high zero; 20 high go; 20 wake > high")
+    during_ns = one.now_ns + 100 * MS
+    one.play("300 wake > -; 10 wake")
+    for arrived_ns in (during_ns, one.now_ns):
+        echo = Echo(1, arrived_ns)
+        assert one.accept(Command("high", GO, arrived_ns, echo=echo, age_ns=0)) == ""
+        assert one.arbiter.until_ns == 0  # the robot must choose again

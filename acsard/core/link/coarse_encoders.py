@@ -29,7 +29,7 @@ LARGEST_JUMP = 1.5 * COARSEST_COUNT
 
 # Jumps, each in the other direction than the one before, of a wheel in a block of `CHANGES` of the
 # speeds of all wheels: fewer are damaged lines.
-MIN_JUMPS, CHANGES = 3, 256
+MIN_JUMPS, CHANGES = 3, 96
 
 # Over a longer time than this, a change of speed may be an acceleration.
 MAX_INTERVAL_S = 0.03
@@ -52,8 +52,9 @@ class CoarseEncoders(Struct):
         self.found, self.changes, self.jumps = "", 0, [0] * 4
 
     def step(self, speeds: Wheels4, elapsed: Seconds) -> RadPerS:
-        """Add a line, and return a bound of the change of a speed by one count; inf if unknown.
+        """Add a line, and return a bound of the change of a speed by one count.
 
+        It is inf if unknown, and 0 for fine encoders, whose counts a motor's own changes cover.
         `elapsed` is the time since the line before it, which may have been lost.
         """
         seconds = elapsed if elapsed > MIN_COUNT_S else MIN_COUNT_S
@@ -66,7 +67,7 @@ class CoarseEncoders(Struct):
             self.speeds = speeds
         self.seconds = seconds
         if self.found == "fine":
-            return fine
+            return 0.0
         if self.found == "coarse":
             self.lines += 0.0 < elapsed < MAX_INTERVAL_S
             return LARGEST_JUMP / seconds

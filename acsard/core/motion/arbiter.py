@@ -78,6 +78,7 @@ class Arbiter(Struct):
 
     sources: dict[str, SourceSenders] = {}
     holder: tuple[str, str] = NOBODY  # source that drives or waits, and sender that drives
+    follows: bool = False  # the last choice has the twist of this sender
     since_ns: Ns = 0  # zeros from then on arm
     caught_up_ns: Ns = 0  # until then, commands may arrive that waited during the last stall
     # From then on a pause counts: the robot could drive, and the daemon did not stand still.
@@ -153,7 +154,8 @@ class Arbiter(Struct):
             sender.refuse(command, why)
             return why
         if (
-            (command.source, command.sender) == self.holder
+            self.follows
+            and (command.source, command.sender) == self.holder
             and sender.repeats(command, timeout)
             and not command.shared
             and sender.hint is None
@@ -210,7 +212,7 @@ class Arbiter(Struct):
                 )
                 if best is None or rank < best:
                     best, first = rank, (settings, name, sender)
-        self.until_ns = until_ns
+        self.until_ns, self.follows = until_ns, False
         if first is None:
             self.holder = NOBODY
             for settings in ranking(commands):
@@ -222,6 +224,7 @@ class Arbiter(Struct):
         self.holder = settings.name, name if armed else ""
         if not (armed and sender.is_live(now_ns, timeout_ns(settings))):
             return Choice(settings.name, None, _wait(sender, settings, now_ns, True), name)
+        self.follows = True
         wait, since_ns = NOTHING, sender.zeros_ns
         if since_ns is not None and now_ns - since_ns >= LASTING_NS:
             kept = self._without_effect(now_ns, commands)

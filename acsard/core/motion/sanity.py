@@ -15,7 +15,7 @@ from operator import sub
 
 from msgspec import Struct
 
-from acsard.core.link.coarse_encoders import COARSEST_COUNT, JUMP_SPEED, MIN_COUNT_S
+from acsard.core.link.coarse_encoders import COARSEST_COUNT, JUMP_ANGLE, JUMP_SPEED, MIN_COUNT_S
 from acsard.core.link.feedback import Line
 from acsard.core.values import WHEELS, Event, RadPerS, Wheels4, WheelSpeeds
 
@@ -150,8 +150,11 @@ class Sanity(Struct):
         # time moves nothing, so no count in it is excused.
         most = max(fastest + JUMP_SPEED, COARSEST_COUNT / usual) if own > 0.0 else fastest
         beyond, speeds = list(self.beyond), line.speeds.as_tuple()
+        # Fine encoders have no step, but without declared counts one of them may be over the limit.
+        undeclared = 0.0 if line.count else JUMP_ANGLE
+        one = min(max(line.step * usual, undeclared), COARSEST_COUNT)
         for wheel, now in enumerate(speeds):
-            size, time, count = abs(now), usual, min(line.step * usual, COARSEST_COUNT)
+            size, time, count = abs(now), usual, one
             if turned is not None:
                 count = line.count
                 if now and turned[wheel]:
