@@ -416,7 +416,7 @@ class Robot:
         )
         state.odometry.skipped.add(line)
         if state.sanity.failed:
-            cause = why if self.config.mcu.encoder_counts else f"{why}; {UNDECLARED}"
+            cause = f"{why}; {UNDECLARED}" if state.session.coarse_lines else why
             self._fault(reason("impossible_speeds", cause=cause), now, events)
         return False
 

@@ -56,6 +56,13 @@ def test_status_lines_are_no_replies_and_damaged_ones_change_nothing() -> None:
     assert rig.snapshot.state.emergency_stop == "released"
 
 
+def test_a_status_line_that_begins_while_nothing_else_changes_is_processed_at_once() -> None:
+    rig = Rig().driving(steps=1200)
+    rig.board(b"!status temp=30.5\r\n").step()
+    assert rig.snapshot.board["temperature_c"] == "30.5"
+    assert rig.run(20, GO).mode == "driving"
+
+
 # bumpers
 
 FREE, FRONT, REAR, BOTH = [b"!status bumpers=%b\r\n" % m for m in (b"..", b"X.", b".X", b"XX")]
