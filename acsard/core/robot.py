@@ -275,7 +275,6 @@ class Robot:
             return
         state.count("lines_sent")
         motion, speeds = (AT_REST, STILL) if trip else (draft.motion, draft.speeds)
-        silent, is_robots = session.silent(draft.made_ns), not trip
         state.out.wrote(
             self.link_setup,
             line,
@@ -283,8 +282,8 @@ class Robot:
             draft.made_ns,
             motion,
             speeds,
-            silent=silent,
-            is_robots=is_robots,
+            silent=session.silent(draft.made_ns),
+            trip=bool(trip),
         )
         if line == QUESTION_LINE:
             session.asks(at_ns)

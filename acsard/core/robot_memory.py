@@ -1,8 +1,8 @@
 """All that a robot knows between two steps, as plain data.
 
 A recording stores it as it is, beside the memory of the guard (`guard.py`). With the inputs of the
-later steps both give all later outputs.
-No field contains configuration: `Robot` has that beside it, and each method gets it as an argument.
+later steps, both give all later outputs. No field contains configuration: `Robot` has that beside
+it, and each method gets it as an argument.
 """
 
 from __future__ import annotations

@@ -23,7 +23,7 @@ class Rate(NamedTuple):
 class Throttle(Struct):
     """Limits the rate of each name."""
 
-    free_ns: dict[str, Ns] = {}  # when the whole burst is free again; names that are free may lack
+    free_ns: dict[str, Ns] = {}  # when the whole burst of a name is free again; past if missing
 
     def take(self, now_ns: Ns, rate: Rate, name: str = "") -> bool:
         """Use `name` once; return False if its rate is used up."""

@@ -196,7 +196,7 @@ class Host:
         line = session.line(self.setup, out, now_ns, ROLLING)
         if line is not None:
             silent = session.silent(now_ns)
-            out.wrote(self.setup, line, now_ns, now_ns, AT_REST, ROLLING, silent=silent)
+            out.wrote(self.setup, line, now_ns, now_ns, AT_REST, ROLLING, silent=silent, trip=False)
         if line == QUESTION_LINE:
             session.asks(now_ns)
         return line

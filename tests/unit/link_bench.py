@@ -76,7 +76,7 @@ class LinkBench:
             self.out.dropped(made_ns, closed=session.link == "down", trip=False)
             return
         silent = session.silent(made_ns)
-        self.out.wrote(self.setup, line, made_ns, made_ns, AT_REST, SLOW, silent=silent)
+        self.out.wrote(self.setup, line, made_ns, made_ns, AT_REST, SLOW, silent=silent, trip=False)
         if line == QUESTION_LINE:
             session.asks(made_ns)
 

@@ -78,7 +78,7 @@ class Bench:
     def sends(self, ms: float) -> None:
         """Let a line leave `ms` from now."""
         at_ns, line = self.now_ns + int(ms * MS), self.setup.codec.encode(SPEEDS)
-        self.out.wrote(self.setup, line, at_ns, at_ns, AT_REST, SPEEDS, silent=False)
+        self.out.wrote(self.setup, line, at_ns, at_ns, AT_REST, SPEEDS, silent=False, trip=False)
 
     def answered(
         self, sent_ms: float, came_ms: float, *lost: float, gap: bool = False

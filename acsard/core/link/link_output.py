@@ -66,12 +66,12 @@ class Output(Struct):
         speeds: WheelSpeeds,
         *,
         silent: bool,
-        is_robots: bool = True,
+        trip: bool,
     ) -> None:
         """Record a line that left. `silent`: the board is, so the line is a stop or the question.
 
-        The board is not expected to answer a line that is not the robot's (`is_robots`): zeros in
-        place of one that the guard forbids.
+        `trip`: the line has zeros in place of one that the guard forbids, and the board is not
+        expected to answer it.
         """
         self.pause_ns, self.at_ns, self.blocked_since = at_ns - self.at_ns, at_ns, None
         if line == QUESTION_LINE:
@@ -80,7 +80,7 @@ class Output(Struct):
         if silent:
             self.stop_ns = made_ns
         self.motion, self.speeds, self.made_ns = motion, speeds, made_ns
-        if not is_robots:
+        if trip:
             return
         lines = self.lines
         lines.append(line)

@@ -11,9 +11,6 @@ from msgspec import Struct
 from acsard.core.link.link_setup import LinkSetup
 from acsard.core.values import NS_PER_S, Ns, Seconds
 
-# Between two steps: until then no part has to ask. It is the least `LinkSetup.late_step_ns`.
-STEADY_NS = NS_PER_S // 20
-
 # Between two steps: the second is late for commands and reports. The longest period is 100 ms. A
 # line is missing earlier, by `LinkSetup.late_step_ns`.
 LATE_NS = 150_000_000
@@ -36,7 +33,7 @@ class StepTimes(Struct):
 
     @property
     def is_steady(self) -> bool:
-        return self.passed_ns < STEADY_NS
+        return not (self.step_s or self.is_late)
 
     @property
     def is_late(self) -> bool:

@@ -67,21 +67,21 @@ class Sanity(Struct):
         """Whether the last `FAULT_LINES` lines were impossible, which latches a fault."""
         return self.count >= FAULT_LINES
 
-    def impossible(self, feedback: Line, fastest: RadPerS) -> str:
+    def impossible(self, line: Line, fastest: RadPerS) -> str:
         """Return why no wheel can have these speeds, or ""; `fastest` is `feedback.wheel_speed`.
 
         The allowed change grows with the time since the last possible line, so a real jump is
         accepted in time. Updates `failed` and `warning`.
         """
-        dt, since = feedback.dt, feedback.since
+        dt, since = line.dt, line.since
         since = dt if dt > since else since
         self.since += since
         longest = self.longest - since if self.longest > since else 0.0
         self.longest = longest if longest > since else since
-        if feedback.gap:
+        if line.gap:
             self.last, self.beyond = None, NOT_FAST
             self.rejected.clear()
-        speeds, last = feedback.speeds, self.last
+        speeds, last = line.speeds, self.last
         wheels = speeds.as_tuple()
         change = 0.0 if last is None else max(map(abs, map(sub, wheels, last.as_tuple())))
         why = ""
@@ -91,11 +91,11 @@ class Sanity(Struct):
         over = beyond is not NOT_FAST or max(map(abs, wheels)) > fastest
         if over or (sudden and change > self._most(self.since, longest)):
             most = self._most(self.since, longest)
-            why = self._too_fast(feedback, fastest)
+            why = self._too_fast(line, fastest)
             if not why and last is not None:
-                why = self._jump(feedback, last, most)
+                why = self._jump(line, last, most)
                 if why:
-                    agrees = not self.trusted and self._agrees(feedback, longest)
+                    agrees = not self.trusted and self._agrees(line, longest)
                     self.rejected = [*self.rejected[1 - FAULT_LINES :], (speeds, self.since)]
                     why = "" if agrees else why
         self.lines += 1
