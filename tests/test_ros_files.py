@@ -94,7 +94,7 @@ def published_names(direction: str) -> set[str]:
 # acsar.urdf
 
 
-@each("name", CONFIG.joints.as_tuple())
+@each("name", CONFIG.joint_names)
 def test_each_wheel_touches_the_floor_at_half_the_wheel_separation(name: str) -> None:
     radius, half = CONFIG.drive.wheel_radius, CONFIG.drive.wheel_separation / 2
     assert find_only(joint(name), "parent").get("link") == CONFIG.odometry.base_frame
@@ -128,7 +128,7 @@ def test_ros2_control_has_what_the_topic_hardware_needs() -> None:
     assert parameters["joint_commands_topic"] == "/joint_commands"
     assert parameters["joint_states_topic"] == "/joint_states"
     assert parameters["trigger_joint_command_threshold"] == "-1"
-    assert tuple(j.get("name") for j in control.findall("joint")) == CONFIG.joints.as_tuple()
+    assert tuple(j.get("name") for j in control.findall("joint")) == CONFIG.joint_names
     for wheel in control.findall("joint"):
         assert [c.get("name") for c in wheel.findall("command_interface")] == ["velocity"]
         states = [s.get("name") for s in wheel.findall("state_interface")]

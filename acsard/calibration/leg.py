@@ -27,7 +27,7 @@ from acsard.core.config.settings import Config
 from acsard.core.messages.encodings import DecodeError, Decoder
 from acsard.core.messages.keys_and_roles import IMU
 from acsard.core.messages.schema import Imu, JointState, Odometry, PoseStamped, TwistStamped
-from acsard.core.values import NS_PER_S, Seconds
+from acsard.core.values import NS_PER_S, Seconds, wheels4
 from acsard.host import clock
 from acsard.host.errors import NoAnswerError, NotDrivenError
 from acsard.terminal.prompt import Prompt
@@ -156,7 +156,7 @@ class Recorder:
 
     def __init__(self, client: Connection, config: Config, prompt: Prompt) -> None:
         self._client, self._config, self._prompt = client, config, prompt
-        joints = config.joints.as_tuple()
+        joints = config.joint_names
 
         def speeds(message: JointState) -> tuple[float, ...]:
             found = dict(zip(message.name, message.velocity, strict=False))
@@ -165,7 +165,7 @@ class Recorder:
                     f"wheel_states has no speed of {missing[0]}: if another program publishes on "
                     "this key, stop it"
                 )
-            fr, fl, rl, rr = (found[joint] for joint in joints)
+            fr, fl, rl, rr = wheels4([found[joint] for joint in joints])
             return (fl + rl) / 2, (fr + rr) / 2
 
         def twist(message: TwistStamped) -> tuple[float, ...]:

@@ -211,7 +211,7 @@ class Board:
     @property
     def line_s(self) -> float:
         """Time for the transmission of the longest line, with a margin of 25 %, s."""
-        longest = line_bytes(True, self.sealed, self.sampled)
+        longest = line_bytes(4, True, self.sealed, self.sampled)
         return 1.25 * wire_ns(longest, self.baud_rate) / NS_PER_S
 
     @property
@@ -358,7 +358,7 @@ class Board:
                     continue
                 at_s = (at_ns - wire_ns(following, self.baud_rate)) / NS_PER_S
                 reply = self._reply(line, at_s)
-                self.traffic.line(line, reply is not None)
+                self.traffic.line(line, reply is not None, 4)
                 self.good_run = self.good_run + 1 if reply is not None else 0
                 self.longest_run = max(self.longest_run, self.good_run)
                 if restart := self.restarts.check_line(line, at_s, reply):
@@ -387,7 +387,7 @@ class Board:
         try:
             plain, reading = line, None
             if self.sealed or b"#" in line:
-                checked = unseal(line)
+                checked = unseal(line, 4)
                 plain, reading = checked.plain, checked.reading
             return BoardReply(at_s, self._codecs[False].decode(plain).as_tuple(), line, reading)
         except FrameError:

@@ -180,7 +180,7 @@ def rate(board: Board) -> Finding:
     unasked = board.listen(WATCHDOG_SILENCE_S)
     # Late replies to earlier lines arrive almost at the same time, unlike reports.
     board.own_clock = bool(unasked) and unasked[-1].at_s - unasked[0].at_s > SHORT_MEASUREMENT_S
-    highest_hz = highest_rate(board.baud_rate, line_bytes(board.comma), COMFORTABLE_USE)
+    highest_hz = highest_rate(board.baud_rate, line_bytes(4, board.comma), COMFORTABLE_USE)
     period_s, before = 1 / min(board.rate_hz, highest_hz), board.sent_lines
     answers = board.drive(ZERO, 0.5, period_s)
     if len(answers) < 10:

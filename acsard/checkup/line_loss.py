@@ -90,7 +90,7 @@ def finding(board: Board) -> Finding:
 
 
 def _period_s(board: Board) -> float:
-    longest = line_bytes(board.comma, board.sealed, board.sampled)
+    longest = line_bytes(4, board.comma, board.sealed, board.sampled)
     period_s = 1 / min(board.rate_hz, highest_rate(board.baud_rate, longest, COMFORTABLE_USE))
     if not board.own_clock and board.gap_s > 1.5 * period_s:
         return 1.25 * board.gap_s

@@ -31,6 +31,10 @@ FAIL baud rate: received_form | replies in another form
     at {configured} baud {heard}; no good line at any other rate
     -> the lines are whole, but the firmware must send `ap00.00,bp00.00,cp00.00,dp00.00`: p or n as
     the sign, and two digits, a point and two digits in each figure, without spaces
+FAIL baud rate: received_letters | other motors
+    at {configured} baud {heard}; no good line at any other rate
+    -> the lines are whole, but do not name each motor of mcu.wheels once: write the letters of the
+    board's lines into [mcu.wheels], of four wheels, or of `left` and `right` if two are driven
 FAIL baud rate: received_cut | pieces of lines
     at {configured} baud {heard}; no good line at any other rate
     -> the firmware cuts its replies short or omits the line end: it must send all four values and

@@ -14,7 +14,7 @@ from pathlib import Path
 
 from acsard.cli.common import add_config, load
 from acsard.core.config.settings import Config
-from acsard.core.config.simulated_faults import FAULTS, form, parse
+from acsard.core.config.simulated_faults import FAULTS, Parsed, form, parse
 from acsard.core.simulator.fake_mcu import FakeMcu
 from acsard.daemon.serial.simulator_pty import SimPty
 from acsard.host import clock
@@ -22,8 +22,8 @@ from acsard.host.errors import UsageError
 
 # The words in capitals that the rows of the table do not explain.
 LEGEND = """\
-faults (MOTOR is a, b, c or d; START is the time in seconds until the fault begins, and SECONDS is
-its duration; 0 SECONDS means that it does not end):"""
+faults (MOTOR is the letter of a motor, such as a; START is the time in seconds until the fault
+begins, and SECONDS is its duration; 0 SECONDS means that it does not end):"""
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -35,7 +35,6 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         "--fault",
         action="append",
         default=[],
-        type=fault,
         metavar="NAME",
         help="simulate the fault NAME, such as ftdi or bias=a:0.9, of the list of faults; repeat "
         "the option for several faults",
@@ -47,18 +46,15 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def fault(text: str) -> str:
-    """Return a fault such as `bias=a:0.9`, as an argparse type."""
-    try:
-        parse(text)
-    except ValueError as error:
-        raise argparse.ArgumentTypeError(f"{text}: {error}") from None
-    return text
-
-
 def main(args: argparse.Namespace) -> int:
     _, config = load(args.config)
-    return asyncio.run(_play(config, args))
+    faults = []
+    for text in args.fault:
+        try:
+            faults.append(parse(text, config.mcu.wheels.letters))
+        except ValueError as error:
+            raise UsageError(f"--fault {text}: {error}") from None
+    return asyncio.run(_play(config, args, faults))
 
 
 def _make_link(link: Path, device: str) -> None:
@@ -80,22 +76,22 @@ def _remove_link(link: Path, device: str) -> None:
         link.unlink()
 
 
-async def _play(config: Config, args: argparse.Namespace) -> int:
+async def _play(config: Config, args: argparse.Namespace, faults: list[Parsed]) -> int:
     ended = asyncio.Event()
     for number in (signal.SIGTERM, signal.SIGINT):
         asyncio.get_running_loop().add_signal_handler(number, ended.set)
     mcu = FakeMcu(config, clock.now().mono_ns)
     with ExitStack() as stack:
-        for fault in args.fault:
-            stack.enter_context(mcu.fault(*parse(fault)))
+        for fault in faults:
+            stack.enter_context(mcu.fault(*fault))
         device = stack.enter_context(SimPty(mcu)).path
         if args.link:
             link = Path(args.link)
             _make_link(link, device)
             stack.callback(_remove_link, link, device)
         print(f"acsard run --port {args.link or device}", flush=True)
-        faults = ", ".join((*config.sim.faults, *args.fault)) or "none"
-        print(f"simulated MCU on {device}, faults: {faults}; Ctrl-C ends it", file=sys.stderr)
+        listed = ", ".join((*config.sim.faults, *args.fault)) or "none"
+        print(f"simulated MCU on {device}, faults: {listed}; Ctrl-C ends it", file=sys.stderr)
         await ended.wait()
     print(f"the simulated MCU received {mcu.valid_lines} valid lines", file=sys.stderr)
     return 0

@@ -32,7 +32,8 @@ LinkCode = Literal[
     "port_closed", "port_trouble", "port_released", "port_blocked", "booting", "link_up",
     "link_silent", "host_late", "simulator_fault", "echo", "set_points", "no_checksum",
     "replies_damaged", "lines_too_rare", "reply_period", "received_nothing", "received_statuses",
-    "received_text", "received_form", "received_cut", "received_foreign", "received_garbage",
+    "received_text", "received_form", "received_letters", "received_cut", "received_foreign",
+    "received_garbage",
     "received_few", "received_sparse",
 ]  # fmt: skip
 
@@ -296,12 +297,16 @@ received_statuses
 received_text
     no link to the microcontroller: {received};
     -> the firmware prints other text: remove its Serial.print or debug output, and let it send
-    replies such as `ap00.00,bp00.00,cp00.00,dp00.00`
+    replies such as `ap00.00,bp00.00,cp00.00,dp00.00`, with the letters of mcu.wheels
 received_form
     no link to the microcontroller: {received};
     -> the lines are whole, but in another form: the firmware must send
-    `ap00.00,bp00.00,cp00.00,dp00.00` with p or n as the sign, and two digits, a point and two
-    digits in each figure, without spaces
+    `ap00.00,bp00.00,cp00.00,dp00.00` with the letters of mcu.wheels, p or n as the sign, and two
+    digits, a point and two digits in each figure, without spaces
+received_letters
+    no link to the microcontroller: {received};
+    -> the lines are whole, but do not name each motor of mcu.wheels once: write the letters of the
+    board's lines into [mcu.wheels], of four wheels, or of `left` and `right` if two are driven
 received_cut
     no link to the microcontroller: {received};
     -> does the board cut its lines short, or omit the line ends? `acsard mcu check` finds out more

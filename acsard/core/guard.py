@@ -17,10 +17,10 @@ from msgspec import Struct
 from acsard.core.config.settings import Config
 from acsard.core.values import NS_PER_S, Ns, Status, Trip
 
-Hundredths = tuple[int, int, int, int]  # speeds of the motors a to d, in hundredths of rad/s
+Hundredths = tuple[int, ...]  # speeds of the motors, in hundredths of rad/s
 
-_ZERO: Hundredths = (0, 0, 0, 0)
-_COLUMNS = re.compile(rb"a([pn]\d\d\.\d\d),b([pn]\d\d\.\d\d),c([pn]\d\d\.\d\d),d([pn]\d\d\.\d\d)")
+_WORD = re.compile(rb"[a-z]([pn])(\d\d)\.(\d\d)")
+_WORD_BYTES = 8  # with the comma
 _SEAL = re.compile(rb"#[0-9A-F]{2}S?\*[0-9A-F]{4}\r\n")
 _QUESTION = b"?\r\n"
 
@@ -46,9 +46,10 @@ class Guard:
 
     def __init__(self, stop: bytes, config: Config, memory: Memory | None = None) -> None:
         # `stop` has zeros and no checksum: the board accepts it in any state of the link.
-        self._stop = stop
+        self._stop, self._letters = stop, config.mcu.wheels.letters.encode()
+        self._size, self._zero = _WORD_BYTES * len(self._letters) - 1, (0,) * len(self._letters)
         memory = memory or Memory()
-        self._last, self._hundredths = memory.last, _hundredths(memory.last[:31])
+        self._last, self._hundredths = memory.last, self._speeds(memory.last)
         self._commanded_ns, self._halted_ns = memory.commanded_ns, memory.halted_ns
         self._longest = memory.ramp_ns, memory.stop_ramp_ns
         self.use(config)
@@ -63,7 +64,7 @@ class Guard:
         self._most = int(config.limits.wheel_speed * 100 + 1)
         self._timeouts = {s.name: s.timeout * 1e9 for s in config.commands.sources}
         self._ramps = _ramp_ns(config, stop=False), _ramp_ns(config, stop=True)
-        if self._hundredths == _ZERO:
+        if self._hundredths == self._zero:
             self._longest = self._ramps
         else:
             (ramp, stop_ramp), (now, stop_now) = self._longest, self._ramps
@@ -77,8 +78,8 @@ class Guard:
         """Record that `line` was written to the serial port."""
         if line == _QUESTION:
             return
-        self._last, self._hundredths = line, _hundredths(line[:31])
-        if self._hundredths == _ZERO:
+        self._last, self._hundredths = line, self._speeds(line)
+        if self._hundredths == self._zero:
             self._longest = self._ramps
 
     def check(
@@ -102,11 +103,11 @@ class Guard:
         return (self._stop, trip) if trip else (line, "")
 
     def _objection(self, line: bytes, now_ns: Ns, commanded: bool, linked: bool) -> Trip:
-        before = self._hundredths or _ZERO
-        speeds = _hundredths(line[:31])
-        if speeds is None or not (line[31:] == self._stop[31:] or self._sealed(line)):
+        before, size = self._hundredths or self._zero, self._size
+        speeds = self._speeds(line)
+        if speeds is None or not (line[size:] == self._stop[size:] or self._sealed(line)):
             return "guard_line_damaged"
-        if speeds == _ZERO:
+        if speeds == self._zero:
             return ""
         if max(speeds) > self._most or min(speeds) < -self._most:
             return "guard_too_fast"
@@ -141,12 +142,15 @@ class Guard:
     def _sealed(self, line: bytes) -> bool:
         # The end is: a comma if the board needs one, `#` and the sequence number (two hexadecimal
         # digits), at most one request letter, `*` and the CRC-16/XMODEM of all before it.
-        comma = self._stop[31:-2]
+        size, comma = self._size, self._stop[self._size : -2]
         return (
-            line[31:].startswith(comma)
-            and _SEAL.fullmatch(line, 31 + len(comma)) is not None
+            line[size:].startswith(comma)
+            and _SEAL.fullmatch(line, size + len(comma)) is not None
             and line[-7:] == b"*%04X\r\n" % _crc(line[:-7])
         )
+
+    def _speeds(self, line: bytes) -> Hundredths | None:
+        return _hundredths(line[: self._size], self._letters)
 
 
 def _ramp_ns(config: Config, *, stop: bool) -> Ns:
@@ -166,16 +170,19 @@ def _ramp_ns(config: Config, *, stop: bool) -> Ns:
 
 # A steady command repeats the same columns in each line, so a cache of a few lines saves most work.
 @lru_cache(4)
-def _hundredths(columns: bytes) -> Hundredths | None:
-    # In 0.01 rad/s; None if a column is malformed. `columns` are the first 31 bytes of a line.
-    match = _COLUMNS.match(columns)
-    if match is None:
+def _hundredths(columns: bytes, letters: bytes) -> Hundredths | None:
+    # In 0.01 rad/s, in the order of the letters; None if a column is malformed.
+    words = columns.split(b",")
+    if b"".join([word[:1] for word in words]) != letters:
         return None
-    a, b, c, d = [
-        int(word[1:3] + word[4:]) if word[0] == 0x70 else -int(word[1:3] + word[4:])
-        for word in match.groups()
-    ]
-    return a, b, c, d
+    speeds = []
+    for word in words:
+        match = _WORD.fullmatch(word)
+        if match is None:
+            return None
+        way, whole, part = match.groups()
+        speeds.append(int(whole + part) if way == b"p" else -int(whole + part))
+    return tuple(speeds)
 
 
 def _crc(data: bytes) -> int:

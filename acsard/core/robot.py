@@ -91,6 +91,7 @@ def error_model(config: Config) -> ErrorModel:
         config.mcu.encoder_counts,
         config.limits,
         config.feedback,
+        config.mcu.wheels.names,
     )
 
 
@@ -404,7 +405,7 @@ class Robot:
 
     def _is_plausible(self, line: Line, now: Instant, events: list[Event]) -> bool:
         state = self.state
-        why = state.sanity.impossible(line, self.config.feedback.wheel_speed)
+        why = state.sanity.impossible(line, self.config.feedback.wheel_speed, self.model.names)
         if state.sanity.warning is not None:
             events.append(state.sanity.warning)
         if not why:

@@ -57,9 +57,9 @@ class State(Struct):
     draft: Draft
     inputs: BoardInputs
     odometry: Odometry
+    checks: ConsistencyChecks
     out: Output = field(default_factory=Output)
     session: McuSession = field(default_factory=McuSession)
-    checks: ConsistencyChecks = field(default_factory=ConsistencyChecks)
     sanity: Sanity = field(default_factory=Sanity)
     unanswered: UnansweredLines = field(default_factory=UnansweredLines)
     linked_once: bool = False  # the link was up since the start
@@ -94,6 +94,7 @@ def initial(latches: Latches, config: Config, model: ErrorModel) -> State:
         Draft(made_of=(None, life.mode)),
         inputs_after(latches, config),
         Odometry.initial(model),
+        ConsistencyChecks.initial(model),
     )
     if latches.causes:
         kind, why = f"start -> {life.mode}", life.why

@@ -36,7 +36,7 @@ def summary(robot: Robot, now_ns: Ns) -> Snapshot:
             yaw=pose.yaw,
             linear=None if silent else odometry.twist.linear,
             angular=None if silent else odometry.twist.angular,
-            wheels=[] if silent else list(odometry.speeds.as_tuple()),
+            wheels=[] if silent else list(odometry.speeds.as_tuple()[: robot.model.independent]),
             link=status.link,
             source=status.source,
             sources=[

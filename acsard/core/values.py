@@ -6,6 +6,7 @@ time, are never part of a reference cycle.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Annotated, Literal, get_args
 
 from msgspec import Meta, Struct
@@ -18,8 +19,10 @@ from acsard.core.codes import (
     WaitCode,
 )
 
-# The order of every value with one item per wheel.
+# The order of every value with one item per wheel. If only two wheels are driven, their values are
+# the first two, and those of the rear wheels are equal to them.
 WHEELS = ("front_right", "front_left", "rear_left", "rear_right")
+TWO_WHEELS = ("right", "left")  # names of two driven wheels
 
 # Types that name the unit and the clock of a value, so that no sentence has to.
 Ns = int  # monotonic time, or a duration, ns
@@ -30,6 +33,18 @@ RadPerS = float
 Metres = float
 
 Wheels4 = tuple[float, float, float, float]  # a value of each wheel, in `WHEELS` order
+
+
+def wheel_names(count: int) -> tuple[str, ...]:
+    """Return the names of four wheels or two, in the order of their values."""
+    return WHEELS if count == len(WHEELS) else TWO_WHEELS
+
+
+def wheels4(values: Sequence[float]) -> Wheels4:
+    """Return the values of four wheels, in `WHEELS` order, from those of all wheels or of two."""
+    right, left, rear_left, rear_right = values if len(values) == 4 else (*values, *values[::-1])
+    return right, left, rear_left, rear_right
+
 
 NS_PER_S = 1_000_000_000
 NS_PER_US = 1000

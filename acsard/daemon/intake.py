@@ -74,7 +74,7 @@ class Intake:
         self.routers = RouterFollower()
         self.events = events
         self._bus, self._certificate_ends = bus, certificate_ends
-        self._receiver = Receiver(config.joints, Kinematics(config.drive), run)
+        self._receiver = Receiver(config.joint_names, Kinematics(config.drive), run)
         self._gateway, self._imu = GatewayFollower(), GyroFollower(config.mcu.simulated)
         self._top_speed = config.limits.linear_speed  # at the start
         self._began = False

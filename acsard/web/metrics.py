@@ -15,7 +15,7 @@ from acsard.core.link.link_state import LinkState
 from acsard.core.messages.schema import RobotState
 from acsard.core.messages.state_warnings import WARNING_KINDS, warnings
 from acsard.core.motion.modes import Mode
-from acsard.core.values import WHEELS, Event
+from acsard.core.values import Event, wheel_names
 from acsard.web.callers import Reason
 
 CONTENT_TYPE = CONTENT_TYPE_LATEST
@@ -116,7 +116,8 @@ def _add_state(metrics: Metrics, state: RobotState) -> None:
     metrics.gauge("angular_speed_radps", "measured; left is positive", state.angular)
     pose = {("x",): state.x, ("y",): state.y, ("yaw",): state.yaw}
     metrics.gauges("pose", "pose in the frame odom, in m and rad", ("axis",), pose)
-    wheels = {(wheel,): speed for wheel, speed in zip(WHEELS, state.wheels, strict=False)}
+    named = zip(wheel_names(len(state.wheels)), state.wheels, strict=False)
+    wheels = {(wheel,): speed for wheel, speed in named}
     metrics.gauges("wheel_speed_radps", "measured", ("wheel",), wheels)
     metrics.counters("robot", "the daemon's counters", "what", state.counters)
     latencies = {

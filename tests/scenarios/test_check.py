@@ -65,7 +65,7 @@ def test_a_new_mcu_is_driven_with_checked_lines() -> None:
     assert texts(world, "link_check") == []
     lines = moving(world.lines())
     assert len(lines) > 150
-    assert all(protocol.reference(line) and b"#" in line for line in lines)
+    assert all(protocol.reference(line, "abcd") and b"#" in line for line in lines)
     world.run(1.5)
     assert stopped(world)
     assert world.state.x == pytest.approx(world.mcu.vehicle.pose.x, abs=0.005)

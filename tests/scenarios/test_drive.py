@@ -73,7 +73,7 @@ def test_silence_begins_a_ramp_within_the_timeout_and_a_tick(world: World) -> No
 
 
 def test_wheels_can_be_commanded_by_name_in_any_order(world: World) -> None:
-    names = list(reversed(world.config.joints.as_tuple()))
+    names = list(reversed(world.config.joint_names))
     for speed in (*[0.0] * 24, *[10.0] * 40):
         payload = msgspec.msgpack.encode({"name": names, "velocity": [speed] * 4})
         world.put("wheel_cmd/ros2_control", payload)

@@ -240,7 +240,7 @@ class DiffDrive(Tool):
             change = max(-self.STEP, min(self.STEP, self._wanted - self._last))
             self._last = self._wanted if abs(change) < self.STEP else self._last + change
             self.send(self._last)
-            joints = list(self.world.config.joints.as_tuple())
+            joints = list(self.world.config.joint_names)
             stamp = Time.from_ns(self.world.instant.wall_ns)
             message = JointState(Header(stamp), joints, [], [self._last / self.RADIUS] * 4, [])
             arrivals = self.world.bus.arrivals

@@ -38,7 +38,7 @@ def world() -> World:
 def damage(world: World, every: int, speeds: tuple[float, ...]) -> list[int]:
     """Replace each so-many-th line by one with these speeds; return a list of their number."""
     feed, seen, damaged = world.port.feed, 0, [0]
-    text = speeds_text(speeds, world.mcu.switches.separator, False) + b"\r\n"
+    text = speeds_text("abcd", speeds, world.mcu.switches.separator, False) + b"\r\n"
 
     def fed(received: Received) -> None:
         nonlocal seen

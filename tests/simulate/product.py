@@ -497,7 +497,7 @@ class Product:
     def _run_away(self, mcu: FakeMcu, motors: list[int]) -> None:
         """Let these motors keep their set points, whatever the board commands."""
         vehicle = mcu.vehicle
-        places = [mcu._wiring[motor][0] for motor in motors]
+        places = [place for motor in motors for place in mcu._wiring[motor][0]]
         kept = {place: vehicle.set_points[place] for place in places}
 
         def advance(dt: float, push: float | None = None) -> None:
@@ -515,7 +515,7 @@ class Product:
         """Let the board report its set points as speeds, as one without encoders does."""
 
         def speeds(now_ns: int) -> list[float]:
-            return [mcu.vehicle.set_points[wheel] * forward for wheel, forward in mcu._wiring]
+            return [mcu.vehicle.set_points[wheels[0]] * forward for wheels, forward in mcu._wiring]
 
         vars(mcu)["_speeds"] = speeds
         self._lasting.callback(vars(mcu).pop, "_speeds", None)

@@ -57,7 +57,7 @@ class Robot(VirtualWire):
     def faulty(self) -> Iterator[None]:
         with ExitStack() as stack:
             for text in self.faults:
-                stack.enter_context(self.mcu.fault(*parse(text)))
+                stack.enter_context(self.mcu.fault(*parse(text, self.mcu.letters)))
             yield
 
     @contextmanager

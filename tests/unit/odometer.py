@@ -24,7 +24,7 @@ class Odometer:
     ) -> None:
         kinematics = Kinematics(drive)
         self.model = ErrorModel(odometry, kinematics, counts, LimitsConfig())
-        self.checks = ConsistencyChecks()
+        self.checks = ConsistencyChecks.initial(self.model)
         self.odometry = Odometry.initial(self.model)
         self._claims = claims(odometry, kinematics, counts)
 

@@ -95,7 +95,7 @@ class Bench:
         self.feedback = FeedbackConfig(response_time=robot.response_time)
         self.count = count_angle(robot.counts if robot.declared else 0)
         self.unit = math.tau / robot.counts
-        self.wheels: Wheels = new_wheels()
+        self.wheels: Wheels = new_wheels(4)
         self.motion = Motion()
         self.now = 0.0
         self.speeds = [0.0] * 4

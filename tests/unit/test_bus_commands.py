@@ -14,7 +14,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from acsard.core.config.settings import CommandsConfig, DriveConfig, JointsConfig
+from acsard.core.config.settings import CommandsConfig, Config, DriveConfig
 from acsard.core.incoming.commands import Arrival, Receiver
 from acsard.core.messages.encodings import FORMATS, DecodeError, Format, encode
 from acsard.core.messages.refusals import MAX_COMMAND_BYTES
@@ -26,8 +26,8 @@ from acsard.core.values import Pose, Request, Twist, Verb
 from tests.each import each
 
 KINEMATICS = Kinematics(DriveConfig())
-RECEIVER = Receiver(JointsConfig(), KINEMATICS)
-JOINTS = list(JointsConfig().as_tuple())
+JOINTS = list(Config().joint_names)
+RECEIVER = Receiver(JOINTS, KINEMATICS)
 ARRIVED_NS = 77_000_000_000
 AXES = [(part, axis) for part in ("linear", "angular") for axis in "xyz"]
 NOT_FINITE = [math.nan, math.inf, -math.inf]
@@ -153,7 +153,7 @@ def test_a_delete_and_a_wildcard_and_one_byte_too_many_are_refused() -> None:
 
 
 def test_wheel_commands_use_the_configured_joint_names() -> None:
-    receiver = Receiver(JointsConfig("fr", "fl", "rl", "rr"), KINEMATICS)
+    receiver = Receiver(("fr", "fl", "rl", "rr"), KINEMATICS)
     body = joints(*[1.0] * 4, names=["rl", "fr", "rr", "fl"])
     sample = arrival(msgspec.msgpack.encode(body), key="wheel_cmd/app")
     assert receiver.command(sample).twist.linear == pytest.approx(0.05)

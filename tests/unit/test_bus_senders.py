@@ -15,7 +15,7 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 from msgspec.structs import replace
 
-from acsard.core.config.settings import CommandsConfig, JointsConfig
+from acsard.core.config.settings import CommandsConfig, Config
 from acsard.core.incoming.commands import (
     BINDING_NS,
     MAX_BINDINGS,
@@ -167,7 +167,7 @@ IDENTITIES: dict[str, tuple[Arrival, str, str, int | None, bool]] = {
 @each("case", IDENTITIES)
 def test_a_sample_gives_its_sender_clock_and_stamp(case: str) -> None:
     sample, *expected = IDENTITIES[case]
-    result = Receiver(JointsConfig(), KINEMATICS).command(sample)
+    result = Receiver(Config().joint_names, KINEMATICS).command(sample)
     assert [result.sender, result.clock, result.stamp_ns, result.shared] == expected
     unreadable = claimed_identity(replace(sample, payload=b"hello"))
     assert (unreadable.sender, unreadable.shared) == (result.sender, result.shared)
@@ -227,9 +227,9 @@ BEAT = {"run": RUN, "boot_us": BEAT_US}
 def test_the_age_of_a_command_with_an_echo_is_its_arrival_minus_the_beat(form: Any) -> None:
     attachment = form({"sender": "joystick/s3cret", "echo": BEAT})
     sample = ours(twist(), attachment=attachment, boot_ns=(BEAT_US + 7) * 1000)
-    result = Receiver(JointsConfig(), KINEMATICS, RUN).command(sample)
+    result = Receiver(Config().joint_names, KINEMATICS, RUN).command(sample)
     assert (result.echo, result.age_ns) == (Echo(RUN, BEAT_US * 1000), 7000)
-    other_run = Receiver(JointsConfig(), KINEMATICS, RUN + 1).command(sample)
+    other_run = Receiver(Config().joint_names, KINEMATICS, RUN + 1).command(sample)
     assert (other_run.echo, other_run.age_ns) == (result.echo, None)
 
 
@@ -255,7 +255,7 @@ def test_a_command_whose_echo_is_not_a_beat_is_refused(form: Any, echo: object) 
 
 @pytest.mark.parametrize(("first", "second"), [("", "/anna"), ("/anna", ""), ("/anna", "/ben")])
 def test_a_sender_id_under_a_second_certificate_is_refused(first: str, second: str) -> None:
-    receiver = Receiver(JointsConfig(), KINEMATICS)
+    receiver = Receiver(Config().joint_names, KINEMATICS)
     sample = ours(twist(), key=f"cmd/app{first}", attachment=signed())
     receiver.command(sample)
     with pytest.raises(DecodeError, match="already in use") as raised:

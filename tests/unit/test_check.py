@@ -41,7 +41,7 @@ def closed(body: bytes) -> bytes:
 
 def reason(line: bytes) -> str:
     with pytest.raises(FrameError) as caught:
-        unseal(line)
+        unseal(line, 4)
     return caught.value.reason
 
 
@@ -64,11 +64,11 @@ def test_a_sealed_command_is_the_line_followed_by_its_suffix_and_check(
 def test_the_examples_of_the_protocol_are_right() -> None:
     assert crc(b"123456789") == 0x31C3  # the check value of the catalogue
     assert closed(REPLY[:-5]) == REPLY
-    assert unseal(REPLY) == Checked(SEED_LINE, 7, None)
+    assert unseal(REPLY, 4) == Checked(SEED_LINE, 7, None)
     line = closed(SAMPLE)
     assert len(line) + 2 == 62 < MAX_LINE_BYTES
     reading = Reading(0x0FA0, (0x0001, 0xFFFF, 0x8000, 0x7FFF))
-    assert unseal(line) == Checked(SEED_LINE, 7, reading)
+    assert unseal(line, 4) == Checked(SEED_LINE, 7, reading)
 
 
 @each(

@@ -49,7 +49,7 @@ def test_silence_ends_the_check_only_during_a_drive() -> None:
 
 def test_motors_that_turn_alone_but_not_together_end_the_check() -> None:
     def gives_in(line: bytes) -> protocol.BoardCommand | None:
-        command = protocol.reference(line)
+        command = protocol.reference(line, "abcd")
         if command and sum(map(bool, command.values.values())) > 1:
             return protocol.BoardCommand(dict.fromkeys(command.values, 0.0))
         return command

@@ -218,7 +218,7 @@ class Regulates(Robot):
         vars(self.mcu)["understand"] = self._regulated
 
     def _regulated(self, line: bytes) -> protocol.BoardCommand | None:
-        command = protocol.reference(line)
+        command = protocol.reference(line, "abcd")
         if command is None:
             return None
         for motor, target in command.values.items():

@@ -120,7 +120,7 @@ def test_a_later_step_reports_a_fault_that_an_earlier_step_could_not_judge() -> 
             return self.looked and super().wakes_late()
 
     def obeys(line: bytes) -> protocol.BoardCommand | None:
-        command = None if b"#" in line else protocol.reference(line)
+        command = None if b"#" in line else protocol.reference(line, "abcd")
         if command and not line.endswith(b",\r\n"):
             if robot.looked:
                 return None

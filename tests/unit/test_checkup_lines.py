@@ -119,7 +119,7 @@ def test_firmware_that_obeys_broken_lines_never_gets_more_than_the_commanded_spe
     robot = Robot("comma_latched", trailing_comma=True)
     with robot.board() as board:
         assert watchdog.finding(board, ALL).figure.endswith("damaged lines keep it from acting")
-    commands = [protocol.latched(line).values.values() for _, line in robot.mcu.heard]
+    commands = [protocol.latched(line, "abcd").values.values() for _, line in robot.mcu.heard]
     assert max(abs(value) for values in commands for value in values) == SPEED
 
 

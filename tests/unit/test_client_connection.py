@@ -19,7 +19,7 @@ from acsard.client.asynchronous import AsyncClient
 from acsard.client.connection import MIN_SPACING_S, Connection
 from acsard.client.driving import UnheardError
 from acsard.client.identity import ClientIdentity
-from acsard.core.config.settings import Config, DriveConfig, JointsConfig
+from acsard.core.config.settings import Config, DriveConfig
 from acsard.core.incoming.commands import Arrival, Receiver
 from acsard.core.incoming.queries import Queries, Query
 from acsard.core.messages import schema
@@ -36,7 +36,7 @@ from acsard.host import clock
 from acsard.host.errors import ReplyError
 from tests.each import each
 
-RECEIVER = Receiver(JointsConfig(), Kinematics(DriveConfig()))
+RECEIVER = Receiver(Config().joint_names, Kinematics(DriveConfig()))
 BEAT = schema.Beat(7, 1000)
 INFO = schema.Info("acsar", "1.2.3", 42, "sim", True, 100.0, [], [])
 

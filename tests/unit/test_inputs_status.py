@@ -94,9 +94,10 @@ def test_a_status_line_is_not_a_reply_in_any_dialect(line: bytes) -> None:
         with pytest.raises(FrameError):
             Codec(WheelMap(), comma).decode(line)
     with pytest.raises(FrameError):
-        unseal(line)
-    assert protocol.reference(line) is protocol.plain_only(line) is protocol.prefix(line) is None
-    assert protocol.latched(line + b",").values == {}
+        unseal(line, 4)
+    decoders = protocol.reference, protocol.plain_only, protocol.prefix
+    assert [decode(line, "abcd") for decode in decoders] == [None] * 3
+    assert protocol.latched(line + b",", "abcd").values == {}
 
 
 @each("reply", REPLIES)

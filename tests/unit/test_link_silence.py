@@ -62,7 +62,7 @@ def test_the_diagnosis_says_what_was_received_and_how_it_looks(
     heard = Traffic()
     heard.take(data)
     for line, _ in LineReader().feed(data):
-        heard.line(line, line + b"\r\n" == STOP)
+        heard.line(line, line + b"\r\n" == STOP, 4)
     assert heard.code == heard.diagnosis().code == f"received_{looks}"
     assert counted in heard.counted
     assert heard.counted in heard.diagnosis().text
@@ -75,7 +75,7 @@ def test_no_line_that_the_board_can_send_takes_long_to_classify() -> None:
         def once() -> int:
             start = process_time_ns()
             for _ in range(5):
-                Traffic().line(line, good=False)
+                Traffic().line(line, False, 4)
             return process_time_ns() - start
 
         return min(once() for _ in range(3))
@@ -102,7 +102,7 @@ def test_it_comes_after_three_seconds_and_again_only_when_it_changes() -> None:
             assert silence.complete is not None
             reports.append((tick, silence.complete.code))
     assert reports == [(10, "received_nothing"), (60, "received_garbage")]
-    silence.now.line(STOP, good=True)
+    silence.now.line(STOP, True, 4)
     silence.forget()
     assert (silence.complete, silence.now) == (None, Traffic())
     assert not silence.diagnose(10 * FIRST_DIAGNOSIS_NS)

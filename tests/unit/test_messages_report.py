@@ -120,7 +120,7 @@ def test_the_messages_of_a_sample_have_its_stamp_its_values_and_the_configured_f
     turned = TransformStamped(header, "r7/base", Transform(place, HALF))
     assert messages["tf"] == TFMessage([turned])
     assert messages["wheel_states"] == JointState(
-        Header(STAMP, ""), list(CONFIG.joints.as_tuple()), [10.0, 20.0, 30.0, 40.0],
+        Header(STAMP, ""), list(CONFIG.joint_names), [10.0, 20.0, 30.0, 40.0],
         [1.0, 2.0, 3.0, 4.0], [],
     )  # fmt: skip
 

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from jsonschema import Draft202012Validator
 
 from acsard.core.config.parsing import effective
-from acsard.core.config.settings import Config, JointsConfig, McuConfig, OdometryConfig
+from acsard.core.config.settings import Config, McuConfig, OdometryConfig
 from acsard.core.incoming.commands import Arrival, Receiver
 from acsard.core.incoming.imu import GyroFollower
 from acsard.core.incoming.queries import interfaces, topic_table
@@ -161,7 +161,7 @@ def test_answers_are_valid_by_their_schemas() -> None:
 
 # messages that the daemon accepts
 
-NAMES = list(JointsConfig().as_tuple())
+NAMES = list(Config().joint_names)
 ZERO: dict[str, Any] = {"linear": {}, "angular": {}}
 TURN: dict[str, Any] = {"angular_velocity": {"z": 0.5}}
 WHEELS: dict[str, Any] = {"name": NAMES, "velocity": [1.0, 1, 1, 1.0]}
@@ -182,7 +182,7 @@ def is_accepted(name: str, value: object) -> bool:
         elif key == "imu":
             return GyroFollower().receive(arrival, {"imu_wrong_shape": 0}, []) is not None
         else:
-            Receiver(JointsConfig(), Kinematics(Config().drive)).command(arrival)
+            Receiver(NAMES, Kinematics(Config().drive)).command(arrival)
     except DecodeError:
         return False
     return True

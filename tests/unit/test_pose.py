@@ -116,7 +116,7 @@ def roll(feedback: Line, *skipped: Line) -> Rolled:
     before = Skipped()
     for one in skipped:
         before.add(one)
-    return rolled_over(before, feedback, (10.0,) * 4)
+    return rolled_over(before, feedback, (10.0,) * 4, 4)
 
 
 @each(
@@ -150,7 +150,7 @@ def test_a_wheel_that_alone_is_fast_after_a_gap_does_not_fill_it(wheel: int) -> 
     speeds = [0.0] * 4
     speeds[wheel] = 40.0
     damaged = Line(AT, WheelSpeeds(*speeds), 0.31, bridged=0.3)
-    assert rolled_over(Skipped(), damaged, AT_REST).angles == AT_REST
+    assert rolled_over(Skipped(), damaged, AT_REST, 4).angles == AT_REST
     robot = Odometer()
     robot.fold(line(0.0))
     assert robot.fold(Line(AT, WheelSpeeds(*speeds), LONG_S + 0.04)).pose == Pose()

@@ -272,4 +272,4 @@ def test_a_misspelt_word_gets_a_suggestion(word: str, suggestion: str) -> None:
      ("bias=c:1.2", (2, 1.2)), ("wrong_baud=57600", (57600,)), ("stalls=5:0.15", (5, 0.15))],
 )  # fmt: skip
 def test_a_fault_is_read_with_its_numbers(text: str, values: tuple[float, ...]) -> None:
-    assert simulated_faults.parse(text) == (text.partition("=")[0], *values)
+    assert simulated_faults.parse(text, "abcd") == (text.partition("=")[0], *values)

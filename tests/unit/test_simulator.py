@@ -230,21 +230,22 @@ def closed(body: bytes) -> bytes:
 def test_a_plain_or_a_checked_line_is_a_command_and_any_other_is_none(
     line: bytes, command: BoardCommand | None
 ) -> None:
-    assert reference(line) == command
+    assert reference(line, "abcd") == command
     if b"#" not in line and b"*" not in line:
-        assert plain_only(line) == prefix(line) == command
+        assert plain_only(line, "abcd") == prefix(line, "abcd") == command
 
 
 def test_replies_and_the_identity_line_are_written_as_the_firmware_writes_them() -> None:
     speeds = (12.5, -8.75, 0.0, -120.0)
-    assert protocol.speeds_text(speeds, ",", False) == b"ap12.50,bn08.75,cp00.00,dn99.99"
-    assert protocol.speeds_text(speeds, ", ", True) == b"ap12.50, bn8.75, cp0.00, dn99.99"
+    assert protocol.speeds_text("abcd", speeds, ",", False) == b"ap12.50,bn08.75,cp00.00,dn99.99"
+    assert protocol.speeds_text("abcd", speeds, ", ", True) == b"ap12.50, bn8.75, cp0.00, dn99.99"
     sample = (65536 + 4000, 1, -1, 32768, -32769)
     for counts, suffix in (((), b"#07"), (sample, b"#07@0FA00001FFFF80007FFF")):
         assert PLAIN + protocol.suffix(PLAIN, b"07", counts) + b"\r\n" == closed(PLAIN + suffix)
     line = protocol.identity(3200, 300, sample=True)
     assert line == b"!acsard-mcu 1 counts=3200 watchdog_ms=300 check=1 sample=1\r\n"
-    assert reference(line) is prefix(line) is plain_only(line) is None
+    decoders = reference, prefix, plain_only
+    assert [decode(line, "abcd") for decode in decoders] == [None] * 3
 
 
 # The wire.

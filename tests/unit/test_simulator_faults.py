@@ -138,7 +138,7 @@ def test_each_fault_can_be_turned_on_and_off_and_is_on_at_the_start_if_configure
     text = f"{name}={EXAMPLES[arguments]}" if arguments else name
     mcu, configured = FakeMcu(Config()), FakeMcu(Config(sim=SimConfig(faults=(text,))))
     before = dict(vars(mcu))
-    with mcu.fault(*parse(text)):
+    with mcu.fault(*parse(text, "abcd")):
         assert mcu.switches != before["switches"]
         assert configured.switches == mcu.switches
     assert vars(mcu) == before

@@ -36,7 +36,7 @@ class Bench:
     def __init__(self, counts: int = 3200, encoders: bool = True) -> None:
         self.kinematics, self.count = Kinematics(DriveConfig()), count_angle(counts)
         self.feedback = FeedbackConfig(encoders=encoders)
-        self.wheels = new_wheels()
+        self.wheels = new_wheels(4)
         self.events: list[str] = []
         self.faults: list[str] = []
         self.missed: list[tuple[str, float]] = []  # sides that may have turned, and how far, rad

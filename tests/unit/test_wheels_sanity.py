@@ -128,7 +128,7 @@ def verdicts(sanity: Sanity, some: list[Line], fastest: float = 80.0) -> str:
     """Return for each line: `.` possible, `x` impossible, `F` a fault."""
     found = ""
     for each_line in some:
-        why = sanity.impossible(each_line, fastest)
+        why = sanity.impossible(each_line, fastest, WHEELS)
         found += "F" if sanity.failed else "x" if why else "."
     return found
 
@@ -142,10 +142,10 @@ def test_lines(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
 
 @each("wheel", range(4))
 def test_the_reason_names_the_wheel_and_the_setting(wheel: int) -> None:
-    assert Sanity().impossible(line(-80.01, wheel), 80.0).startswith(WHEELS[wheel])
+    assert Sanity().impossible(line(-80.01, wheel), 80.0, WHEELS).startswith(WHEELS[wheel])
     sanity = Sanity()
     assert verdicts(sanity, lines(0, 0)) == ".."
-    why = sanity.impossible(line(60, wheel), 80.0)
+    why = sanity.impossible(line(60, wheel), 80.0, WHEELS)
     assert why == f"{WHEELS[wheel]} jumps from 0.00 to 60.00 rad/s, which is over 1500 rad/s2"
 
 
@@ -194,7 +194,7 @@ def warnings(sanity: Sanity, bad: int) -> list[Event]:
     """Return the warnings after a window of 1000 lines whose first `bad` ones are impossible."""
     found = []
     for i in range(1000):
-        sanity.impossible(ten(200.0 if i < bad else 10.0), 80.0)
+        sanity.impossible(ten(200.0 if i < bad else 10.0), 80.0, WHEELS)
         found.append(sanity.warning)
     assert all(warning is None for warning in found[:10])
     return [warning for warning in found if warning is not None]

@@ -14,7 +14,15 @@ from typing import get_args
 
 from acsard.core.config import motion_rules, simulated_faults
 from acsard.core.config.partial import Rule, mistakes
-from acsard.core.config.settings import HYSTERESIS, SIMULATOR, Baud, Config, McuConfig, is_tls
+from acsard.core.config.settings import (
+    HYSTERESIS,
+    SIMULATOR,
+    Baud,
+    Config,
+    McuConfig,
+    WheelMap,
+    is_tls,
+)
 from acsard.core.config.validation import show
 from acsard.core.config.wire_time import (
     COMFORTABLE_USE,
@@ -26,7 +34,7 @@ from acsard.core.config.wire_time import (
     wire_ns,
     wire_use,
 )
-from acsard.core.values import ROOT_KEY, WHEELS
+from acsard.core.values import ROOT_KEY, TWO_WHEELS, WHEELS
 
 # Control periods in which a wheel may change its count by half of its range: more looks like the
 # other direction. 2 allows for a lost line.
@@ -180,7 +188,7 @@ def _shorter_lines(mcu: McuConfig, rate: float) -> str:
         return ""
     fixes = ((True, "mcu.encoder_counts = 0"), (False, 'mcu.link_check = "off"'))
     for check, fix in fixes:
-        count = line_bytes(mcu.trailing_comma, check)
+        count = line_bytes(len(mcu.wheels.names), mcu.trailing_comma, check)
         if count < mcu.line_bytes and wire_use(rate, mcu.baud_rate, count) <= 1.0:
             return f"; or {fix}, which shortens the lines to {count} B"
     return ""
@@ -212,12 +220,27 @@ def _rate_problems(config: Config) -> list[str]:
 
 
 def _motor_problems(config: Config) -> list[str]:
-    motors = config.mcu.wheels
-    return _repeated("motor", {f"mcu.wheels.{w}": getattr(motors, w)[1] for w in WHEELS})
+    wheels, two = config.mcu.wheels, config.mcu.wheels.names == TWO_WHEELS
+    missing = [name for name in TWO_WHEELS if two and not getattr(wheels, name)]
+    if missing:
+        return [
+            f'mcu.wheels.{missing[0]} = "": the wheel of the other side has a motor; name both, or '
+            'write "" for both if the robot has four driven wheels'
+        ]
+    others = [name for name in WHEELS if two and getattr(wheels, name) != getattr(WheelMap(), name)]
+    if others:
+        return [
+            f"mcu.wheels.{others[0]} = {show(getattr(wheels, others[0]))}: mcu.wheels.left and "
+            "mcu.wheels.right say that two wheels are driven; delete the lines of the four wheels, "
+            'or write left = "" and right = ""'
+        ]
+    motors = zip(wheels.names, wheels.motors, strict=True)
+    return _repeated("motor", {f"mcu.wheels.{name}": motor[1] for name, motor in motors})
 
 
 def _joint_problems(config: Config) -> list[str]:
-    return _repeated("joint name", {f"joints.{w}": getattr(config.joints, w) for w in WHEELS})
+    joints = zip(config.mcu.wheels.names, config.joint_names, strict=True)
+    return _repeated("joint name", {f"joints.{name}": joint for name, joint in joints})
 
 
 def _source_name_problems(config: Config) -> list[str]:

@@ -11,7 +11,7 @@ from typing import Annotated, Literal
 from msgspec import Meta, Struct
 
 from acsard.core.config.wire_time import COMFORTABLE_USE, highest_rate, line_bytes
-from acsard.core.values import NS_PER_S, BatteryLevel, Role
+from acsard.core.values import NS_PER_S, TWO_WHEELS, WHEELS, BatteryLevel, Role
 
 Name = Annotated[
     str,
@@ -119,7 +119,16 @@ WheelSpeed = Annotated[float, Meta(ge=0.1, le=99.99, extra={"unit": "rad/s"})]
 ErrorRate = Annotated[float, Meta(ge=0.0, le=10.0)]
 Deviation = Annotated[float, Meta(ge=0.0, le=1.0)]
 PublishRate = Annotated[float, Meta(ge=0.0, le=1000.0, extra={"unit": "Hz (0 = every sample)"})]
-Motor = Literal["+a", "-a", "+b", "-b", "+c", "-c", "+d", "-d"]
+MOTOR_UNIT = 'a sign and the letter of a motor, such as "+a" (a to z without n and p)'
+Motor = Annotated[
+    str, Meta(pattern=r"^[+-][a-moq-z]\Z", extra={"unit": MOTOR_UNIT, "example": "+a"})
+]
+MotorOfTwo = Annotated[
+    str,
+    Meta(
+        pattern=r"^([+-][a-moq-z])?\Z", extra={"unit": f"{MOTOR_UNIT}, or empty", "example": "+l"}
+    ),
+]
 EncoderCounts = Annotated[
     int, Meta(ge=0, le=100_000, extra={"unit": "per wheel turn (0 = unknown)"})
 ]
@@ -135,6 +144,23 @@ class WheelMap(Struct, frozen=True):
     front_left: Motor = "+b"
     rear_left: Motor = "+c"
     rear_right: Motor = "+d"
+    left: MotorOfTwo = ""
+    right: MotorOfTwo = ""
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Return the names of the driven wheels: `right` and `left`, or those in `WHEELS`."""
+        return TWO_WHEELS if self.left or self.right else WHEELS
+
+    @property
+    def motors(self) -> tuple[str, ...]:
+        """Return the sign and the letter of the motor of each wheel, in the order of `names`."""
+        return tuple(getattr(self, name) for name in self.names)
+
+    @property
+    def letters(self) -> str:
+        """Return the letters of the motors in the order of a line."""
+        return "".join(sorted(motor[1] for motor in self.motors))
 
 
 SIMULATOR = "sim"
@@ -176,7 +202,8 @@ class McuConfig(Struct, frozen=True):
     @property
     def line_bytes(self) -> int:
         """Length of the longest serial line that the daemon or the board may send, bytes."""
-        return line_bytes(self.trailing_comma, self.checked, self.wants_samples)
+        motors = len(self.wheels.names)
+        return line_bytes(motors, self.trailing_comma, self.checked, self.wants_samples)
 
 
 class ControlConfig(Struct, frozen=True):
@@ -204,10 +231,8 @@ class JointsConfig(Struct, frozen=True):
     front_left: FrameId = "front_left_wheel_joint"
     rear_left: FrameId = "rear_left_wheel_joint"
     rear_right: FrameId = "rear_right_wheel_joint"
-
-    def as_tuple(self) -> tuple[str, str, str, str]:
-        """Return the names of the four wheel joints in the order of `values.WHEELS`."""
-        return self.front_right, self.front_left, self.rear_left, self.rear_right
+    left: FrameId = "left_wheel_joint"
+    right: FrameId = "right_wheel_joint"
 
 
 class FeedbackConfig(Struct, frozen=True):
@@ -454,6 +479,11 @@ class Config(Struct, frozen=True):
             return float(self.control.rate)
         mcu = self.mcu
         return float(min(100, highest_rate(mcu.baud_rate, mcu.line_bytes, COMFORTABLE_USE)))
+
+    @property
+    def joint_names(self) -> tuple[str, ...]:
+        """Names of the joints of the driven wheels, in the order of `WheelMap.names`."""
+        return tuple(getattr(self.joints, name) for name in self.mcu.wheels.names)
 
     @property
     def period_ns(self) -> int:

@@ -2,8 +2,8 @@
 
 A row says how a user writes its fault, what the fault does, and which switches it sets.
 `core/simulator/fake_mcu.py` obeys the switches. No fault is random: one that affects only some
-lines affects every n-th. Motors and encoders are numbered 0 to 3 for a to d, an encoder by its
-motor even if encoders are swapped.
+lines affects every n-th. Motors and encoders are numbered from 0 in the order of their letters, an
+encoder by its motor even if encoders are swapped.
 """
 
 from __future__ import annotations
@@ -22,8 +22,6 @@ from acsard.core.config.settings import Baud, Config
 from acsard.core.config.validation import show
 from acsard.core.values import NS_PER_S, Ns
 
-MOTORS = "abcd"
-
 MAX_ARGUMENT = 1e6  # prevents an overflow in the simulator
 
 MIN_STALL_S = 0.001  # a shorter one has no visible effect
@@ -31,6 +29,8 @@ MIN_STALL_S = 0.001  # a shorter one has no visible effect
 NEVER_NS = 2**62
 
 STATUS_NS = NS_PER_S // 10  # between two status lines
+
+Parsed = tuple[str, *tuple[float, ...]]  # name and arguments of a fault
 
 PressedInput = tuple[Ns, Ns, str, str]  # begin, end, field of the status line, value
 
@@ -52,11 +52,16 @@ class Switches(Struct):
 
     baud_rate: int
     bumpers: str  # as the board reports released ones
+    # By motor, in the order of the letters.
+    gains: tuple[float, ...]
+    drivers: tuple[int, ...]  # motor of each output
+    drives: tuple[float, ...]  # from command to set point
+    encoders: tuple[int, ...]  # motor whose encoder is at each input
+    encoder_signs: tuple[int, ...]  # -1: the motor's encoder is reversed
     now_ns: Ns = 0  # when the newest fault began
     muted: bool = False
     noise_bytes: bytes = b""
     cut_replies: bool = False
-    gains: tuple[float, ...] = (1.0,) * 4
     stuck: int | None = None
     frozen: int | None = None
     extra_delay_ns: Ns = 0
@@ -67,11 +72,7 @@ class Switches(Struct):
     watchdog_ns: Ns = 300_000_000  # without a valid line, the board stops the motors
     any_feeds: bool = False  # invalid lines also reset the watchdog
     reply_gap_ns: Ns = 0
-    drivers: tuple[int, ...] = (0, 1, 2, 3)  # motor of each output a to d
-    drives: tuple[float, ...] = (1.0,) * 4  # of each motor, from command to set point
     push: float | None = None  # m/s, by a person
-    encoders: tuple[int, ...] = (0, 1, 2, 3)  # motor whose encoder is at each input a to d
-    encoder_signs: tuple[int, ...] = (1,) * 4  # -1: the motor's encoder is reversed
     firmware: Literal["reference", "latched", "prefix", "plain_only"] = "reference"
     samples: bool = True
     latency_ns: Ns = 0  # of the USB adapter, which sends its packet then; 0: none
@@ -262,10 +263,10 @@ def form(name: str) -> str:
     return "=".join(filter(None, (name, FAULTS[name].arguments)))
 
 
-def parse(text: str) -> tuple[str, *tuple[float, ...]]:
+def parse(text: str, letters: str) -> Parsed:
     """Return the name and the arguments of a fault such as `stalls=5:0.15`.
 
-    The motors a to d are 0 to 3. Raises `ValueError` with mistake and fix.
+    A motor is its place in `letters`. Raises `ValueError` with mistake and fix.
     """
     name, _, arguments = text.partition("=")
     if name not in FAULTS:
@@ -276,7 +277,7 @@ def parse(text: str) -> tuple[str, *tuple[float, ...]]:
     kinds, words = (list(filter(None, t.split(":"))) for t in (fault.arguments, arguments))
     if len(words) != len(kinds):
         raise ValueError(f"write it as {form(name)}")
-    values = [_value(kind, word) for kind, word in zip(kinds, words, strict=True)]
+    values = [_value(kind, word, letters) for kind, word in zip(kinds, words, strict=True)]
     if not fault.accepts(*values):
         raise ValueError(fault.advice)
     return name, *values
@@ -296,7 +297,7 @@ def _problems(config: Config) -> list[str]:
     errors = []
     for i, text in enumerate(config.sim.faults):
         try:
-            parse(text)
+            parse(text, config.mcu.wheels.letters)
         except ValueError as error:
             errors.append(f"sim.faults[{i}] = {show(text)}: {error}")
     return errors
@@ -305,11 +306,11 @@ def _problems(config: Config) -> list[str]:
 RULES: tuple[Rule, ...] = (_problems,)
 
 
-def _value(kind: str, word: str) -> float:
+def _value(kind: str, word: str, letters: str) -> float:
     if kind == "MOTOR":
-        if word not in tuple(MOTORS):
-            raise ValueError("the motors are a, b, c and d")
-        return MOTORS.index(word)
+        if word not in tuple(letters):
+            raise ValueError(f"the motors are {', '.join(letters[:-1])} and {letters[-1]}")
+        return letters.index(word)
     try:
         value = float(word)
     except ValueError:

@@ -8,11 +8,13 @@ from acsard.core.values import NS_PER_S, Ns
 
 BITS_PER_BYTE = 10  # 8N1: a start bit, eight data bits and a stop bit
 
-PLAIN_BYTES = 33  # `ap12.50,bn08.75,cp15.00,dn10.25` with CR LF; a trailing comma is one more
+# `ap12.50,` of each motor; CR LF instead of the last comma. A trailing comma is one more.
+TOKEN_BYTES, END_BYTES = 8, 1
 
 CHECK_BYTES = 8  # sequence number and checksum, `#07*585F`
 
-SAMPLE_BYTES = 21  # `@`, the board's time and four counts in a reply; a command asks by one letter
+# `@` with the board's time, and the count of each motor, in a reply; a command asks by one letter.
+TIME_BYTES, COUNT_BYTES = 5, 4
 
 STATUS_BYTES = 28  # `!status estop=pressed*F4BC` with CR LF, a typical status line
 
@@ -31,13 +33,19 @@ def wire_ns(count: int, baud_rate: int) -> Ns:
     return count * BITS_PER_BYTE * NS_PER_S // baud_rate
 
 
-def line_bytes(trailing_comma: bool, check: bool = False, sample: bool = False) -> int:
+def plain_bytes(motors: int) -> int:
+    """Return the bytes of a plain line for so many motors, such as `lp08.75,rp12.50` and CR LF."""
+    return TOKEN_BYTES * motors + END_BYTES
+
+
+def line_bytes(motors: int, trailing_comma: bool, check: bool = False, sample: bool = False) -> int:
     """Return the bytes of a command or its reply, whichever is longer.
 
     Each direction has its own wire, so only the longer one limits the rate.
     """
-    checked = PLAIN_BYTES + (CHECK_BYTES if check else 0)
-    return max(checked + trailing_comma + sample, checked + (SAMPLE_BYTES if sample else 0))
+    checked = plain_bytes(motors) + (CHECK_BYTES if check else 0)
+    fields = TIME_BYTES + COUNT_BYTES * motors
+    return max(checked + trailing_comma + sample, checked + (fields if sample else 0))
 
 
 def wire_use(rate_hz: float, baud_rate: int, count: int) -> float:

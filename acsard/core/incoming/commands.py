@@ -8,13 +8,13 @@ refresh the timeout of its source.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from functools import lru_cache
 from typing import Literal
 
 from msgspec import UNSET, Struct, UnsetType
 from msgspec.structs import replace
 
-from acsard.core.config.settings import JointsConfig
 from acsard.core.messages import signature
 from acsard.core.messages.encodings import DecodeError, StrictDecoder, decode_cdr, detect
 from acsard.core.messages.keys_and_roles import COMMANDS, SERVICES, SPEED_LIMIT
@@ -51,6 +51,7 @@ from acsard.core.values import (
     Verb,
     WallNs,
     WheelSpeeds,
+    wheels4,
 )
 from acsard.core.values import Twist as BodyTwist
 
@@ -138,10 +139,10 @@ _payloads = {
 class Receiver:
     """Decodes samples into commands, and service queries into requests."""
 
-    def __init__(self, joints: JointsConfig, kinematics: Kinematics, run: int = 0) -> None:
-        # `run` is that of the daemon's beats.
+    def __init__(self, joints: Sequence[str], kinematics: Kinematics, run: int = 0) -> None:
+        # `joints` are those of the driven wheels, and `run` is that of the daemon's beats.
         self._run = run
-        self._joints = joints.as_tuple()
+        self._joints = joints
         self._kinematics = kinematics
         self._bindings = Bindings()
 
@@ -232,7 +233,7 @@ class Receiver:
     def _wheel_speeds(self, arrival: Arrival) -> tuple[BodyTwist, Header | None, bool]:
         message = _wheels.decode(arrival.encoding, arrival.payload)
         named, count = [message.name.count(joint) for joint in self._joints], len(message.name)
-        if named != [1] * 4 or len(message.velocity) != count:
+        if named != [1] * len(named) or len(message.velocity) != count:
             raise DecodeError(
                 "wrong_wheels",
                 f"the message needs one velocity for each of {', '.join(self._joints)}",
@@ -245,7 +246,7 @@ class Receiver:
         )
         if not all(map(math.isfinite, (*velocity, *position, *effort))):
             raise DecodeError("not_finite", "the wheel speeds contain NaN or infinity")
-        twist = self._kinematics.twist(WheelSpeeds(*velocity))
+        twist = self._kinematics.twist(WheelSpeeds(*wheels4(velocity)))
         if not (math.isfinite(twist.linear) and math.isfinite(twist.angular)):
             raise DecodeError("not_finite", "the wheel speeds are too large to compute a twist")
         return twist, message.header, twist == REST and any(velocity)

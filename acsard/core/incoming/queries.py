@@ -301,7 +301,7 @@ def topic_table(config: Config) -> Topics:
 def interfaces(config: Config, status: Status) -> Interfaces:
     """Return the command and state interfaces of the joints, named as in ros2_control."""
     linked, claimed = status.link == "up", status.mode == "driving"
-    joints = config.joints.as_tuple()
+    joints = config.joint_names
     return Interfaces(
         [HardwareInterface(f"{j}/velocity", "command", "rad/s", linked, claimed) for j in joints]
         + [

@@ -50,7 +50,7 @@ Unknown = Literal["unknown", "leap", "restarted"]
 
 
 class Turned(Struct, frozen=True):
-    """The angles that the motors a to d turned, rad, and the time by the board's clock, s."""
+    """The angles that the motors turned, rad, and the time by the board's clock, s."""
 
     motors: Motors
     dt: float
@@ -83,14 +83,11 @@ class Encoders(Struct):
             return "restarted"
         if setup.fastest * (max(host_ms, mcu_ms) + ROUNDING_MS) >= FIELD_VALUES / 2 - SLACK_COUNTS:
             return "unknown"
-        a, b, c, d = reading.counts
-        was_a, was_b, was_c, was_d = before.counts
-        a, b, c, d = _signed(a - was_a), _signed(b - was_b), _signed(c - was_c), _signed(d - was_d)
+        counts = [_signed(n - was) for n, was in zip(reading.counts, before.counts, strict=True)]
         most = setup.fastest * (mcu_ms + ROUNDING_MS) + SLACK_COUNTS
-        if max(a, b, c, d, -a, -b, -c, -d) > most:
+        if max(counts) > most or min(counts) < -most:
             return "leap"
-        angle = setup.count
-        return Turned((a * angle, b * angle, c * angle, d * angle), mcu_ms / 1000)
+        return Turned(tuple([n * setup.count for n in counts]), mcu_ms / 1000)
 
 
 class CountsCheck(Struct):

@@ -3,6 +3,7 @@
     command  ap12.50,bn08.75,cp15.00,dn10.25#07S*HHHH
     reply    ap12.50,bn08.75,cp15.00,dn10.25#07@TTTTAAAABBBBCCCCDDDD*HHHH
 
+A line of two motors has two values, and its reply two counts.
 `codec.py` handles the part before `#`. Then come the sequence number, request letters (a command)
 or `@` and the sample fields (a reply to `S`), and `*` with the CRC-16/XMODEM of all before it. All
 digits are upper-case hexadecimal, so a line can be written in only one way.
@@ -23,21 +24,24 @@ SEQUENCES = 256  # the number after 255 is 0
 SAMPLE_REQUEST = b"S"  # asks for the sample fields
 
 # The pattern also restricts the characters of the plain part, because the CRC does not detect zero
-# bytes in front of a line.
-_REPLY = re.compile(rb"([a-dnp0-9., ]*)#([0-9A-F]{2})(?:@([0-9A-F]{20}))?\*([0-9A-F]{4})")
+# bytes in front of a line. The sample fields are of four motors or of two.
+_REPLY = re.compile(
+    rb"([a-z0-9., ]*)#([0-9A-F]{2})(?:@([0-9A-F]{20}|[0-9A-F]{12}))?\*([0-9A-F]{4})"
+)
 
-_SAMPLE = struct.Struct(">5H")
+# By the digits of the sample fields.
+_FIELDS = {20: struct.Struct(">5H"), 12: struct.Struct(">3H")}
 
 
 class Reading(Struct, frozen=True):
     """The sample fields of a reply: the board's clock, ms, and its encoder counts at that moment.
 
-    A count of the motors a to d rises when its motor turns in the direction `p`. All are modulo
-    65536.
+    The counts are in the order of the letters. One rises when its motor turns in the direction `p`.
+    All are modulo 65536.
     """
 
     mcu_ms: int
-    counts: tuple[int, int, int, int]
+    counts: tuple[int, ...]
 
 
 class Checked(Struct, frozen=True):
@@ -54,8 +58,11 @@ def seal(line: bytes, sequence: int, letters: bytes = b"") -> bytes:
     return b"%b*%04X\r\n" % (body, binascii.crc_hqx(body, 0))
 
 
-def unseal(line: bytes) -> Checked:
-    """Split a checked reply without its line end into its parts. Raises `FrameError`."""
+def unseal(line: bytes, motors: int) -> Checked:
+    """Split a checked reply of so many motors, without its line end, into its parts.
+
+    Raises `FrameError`.
+    """
     match = _REPLY.fullmatch(line)
     if match is None:
         has_suffix = b"#" in line or b"*" in line
@@ -63,9 +70,9 @@ def unseal(line: bytes) -> Checked:
     plain, sequence, sample, crc = match.groups()
     if binascii.crc_hqx(line[:-5], 0) != int(crc, 16):
         raise FrameError("crc_error", line)
-    return Checked(plain, int(sequence, 16), None if sample is None else _reading(sample))
-
-
-def _reading(sample: bytes) -> Reading:
-    mcu_ms, a, b, c, d = _SAMPLE.unpack(binascii.unhexlify(sample))
-    return Reading(mcu_ms, (a, b, c, d))
+    if sample is None:
+        return Checked(plain, int(sequence, 16), None)
+    mcu_ms, *counts = _FIELDS[len(sample)].unpack(binascii.unhexlify(sample))
+    if len(counts) != motors:
+        raise FrameError("malformed", line)
+    return Checked(plain, int(sequence, 16), Reading(mcu_ms, tuple(counts)))

@@ -1,9 +1,11 @@
-"""Encodes four wheel speeds as one plain line, and decodes such a line.
+"""Encodes the wheel speeds as one plain line, and decodes such a line.
 
 In `ap12.50,bn08.75,cp15.00,dn10.25`, a value is a motor letter, `p` (positive) or `n` (negative),
-and a speed in rad/s. The decoder also accepts spaces after commas, a trailing comma, one or two
-integer digits, and one to three decimals. One invalid value makes the line invalid. In the daemon,
-only this module maps motor letters and signs to wheels.
+and a speed in rad/s. The letters are declared, four of them or two. The decoder also accepts spaces
+after commas, a trailing comma, one or two integer digits, one to three decimals, and any order of
+the letters. One invalid value makes the line invalid. In the daemon, only this module maps motor
+letters and signs to wheels: above it, two driven wheels are four, of which the rear ones do as the
+front ones do.
 """
 
 from __future__ import annotations
@@ -17,7 +19,7 @@ from acsard.core.values import STILL, AcsardError, Wheels4, WheelSpeeds
 
 LETTERS = "abcd"
 
-Motors = tuple[float, float, float, float]  # a value of each motor, a to d, with the board's sign
+Motors = tuple[float, ...]  # a value of each motor, by letter, with the board's sign
 
 MAX_SPEED = 99.99  # rad/s, two digits before the point and two after it
 
@@ -27,9 +29,7 @@ RejectReason = Literal[
     "status_malformed", "status_without_crc", "status_crc_error",
 ]  # fmt: skip
 
-_TOKEN = rb"([abcd][pn])([0-9]{1,2}\.[0-9]{1,3})"
-TOKENS = _TOKEN + (rb", *" + _TOKEN) * 3  # the four values, without a trailing comma
-_LINE = re.compile(TOKENS + rb"(?:, *)?")
+SPEED = rb"[0-9]{1,2}\.[0-9]{1,3}"
 
 
 class FrameError(AcsardError):
@@ -45,68 +45,77 @@ class FrameError(AcsardError):
         return f"{reason}: {line[:60]!r}"
 
 
-class Codec:
-    """Plain lines for one assignment of the motors to the wheels."""
+class MotorCodec:
+    """Plain lines with a speed of each motor, in the order of the letters."""
 
-    def __init__(self, wheels: WheelMap, trailing_comma: bool = False) -> None:
-        motors = (wheels.front_right, wheels.front_left, wheels.rear_left, wheels.rear_right)
-        place = {motor[1]: index for index, motor in enumerate(motors)}
-        self._wiring = tuple(
-            (letter, place[letter], -1.0 if motors[place[letter]][0] == "-" else 1.0)
-            for letter in LETTERS
-        )
+    def __init__(self, letters: str, trailing_comma: bool = False) -> None:
+        self._letters = letters
+        token = rb"([%b][pn])(%b)" % (letters.encode(), SPEED)
+        self._line = re.compile(token + (rb", *" + token) * (len(letters) - 1) + rb"(?:, *)?")
         self._by_word = {
-            letter.encode() + direction: (index, sign * way)
-            for letter, index, sign in self._wiring
+            letter.encode() + direction: (motor, way)
+            for motor, letter in enumerate(letters)
             for direction, way in ((b"p", 1.0), (b"n", -1.0))
         }
         self._end = b",\r\n" if trailing_comma else b"\r\n"
-        self.stop = self._written(STILL)  # zero for all wheels, with line end
-        self._last = (STILL, self.stop)
+        self._unread = (math.inf,) * len(letters)
+        self.stop = self.encode((0.0,) * len(letters))  # zero for all motors, with line end
 
-    def encode(self, speeds: WheelSpeeds) -> bytes:
+    def encode(self, motors: Motors) -> bytes:
         """Return the line, with its end, for speeds clamped to 99.99 and rounded to 0.01 rad/s.
 
         Raises `ValueError` for a speed that is not finite, because that is a bug of the caller.
         """
+        values = [_token(*item) for item in zip(self._letters, motors, strict=True)]
+        return ",".join(values).encode() + self._end
+
+    def decode(self, line: bytes) -> Motors:
+        """Return the speeds in a plain line without its end. Raises `FrameError`."""
+        match = self._line.fullmatch(line)
+        if match is None:
+            raise FrameError("malformed", line)
+        words, places, motors = match.groups(), self._by_word, [*self._unread]
+        for word, figure in zip(words[::2], words[1::2], strict=True):
+            motor, way = places[word]
+            motors[motor] = way * float(figure)
+        if max(motors) > MAX_SPEED or min(motors) < -MAX_SPEED:
+            raise FrameError("duplicate_wheel" if math.inf in motors else "over_range", line)
+        return tuple(motors)
+
+
+class Codec:
+    """Plain lines for one assignment of the motors to the wheels."""
+
+    def __init__(self, wheels: WheelMap, trailing_comma: bool = False) -> None:
+        self.letters = wheels.letters
+        self._line = MotorCodec(self.letters, trailing_comma)
+        signs = [-1.0 if motor[0] == "-" else 1.0 for motor in wheels.motors]
+        places = [self.letters.index(motor[1]) for motor in wheels.motors]
+        # By motor: its wheel and its sign. By wheel: its motor and its sign, the rear like the
+        # front if there are two.
+        self._wheel_of = [(places.index(n), signs[places.index(n)]) for n in range(len(places))]
+        motor_of = [*zip(places, signs, strict=True)]
+        self._motor_of = motor_of if len(motor_of) == 4 else [*motor_of, *motor_of[::-1]]
+        self.stop = self._line.stop
+        self._last = (STILL, self.stop)
+
+    def encode(self, speeds: WheelSpeeds) -> bytes:
+        """Return the line for the wheels, as `MotorCodec.encode` does."""
         last, line = self._last
         if speeds != last:  # a steady command repeats its line in each period
-            line = self._written(speeds)
+            wheel = speeds.as_tuple()
+            line = self._line.encode(tuple([sign * wheel[i] for i, sign in self._wheel_of]))
             self._last = (speeds, line)
         return line
 
-    def _written(self, speeds: WheelSpeeds) -> bytes:
-        wheel = speeds.as_tuple()
-        tokens = [_token(letter, sign * wheel[index]) for letter, index, sign in self._wiring]
-        return ",".join(tokens).encode() + self._end
-
     def wheels(self, motors: Motors) -> Wheels4:
-        """Return values of the motors a to d as values of the wheels, forward positive."""
-        wheel = [0.0] * 4
-        for motor, (_, index, sign) in zip(motors, self._wiring, strict=True):
-            wheel[index] = motor * sign
-        front_right, front_left, rear_left, rear_right = wheel
-        return front_right, front_left, rear_left, rear_right
+        """Return values of the motors as values of the wheels, forward positive."""
+        (a, of_a), (b, of_b), (c, of_c), (d, of_d) = self._motor_of
+        return of_a * motors[a], of_b * motors[b], of_c * motors[c], of_d * motors[d]
 
     def decode(self, line: bytes) -> WheelSpeeds:
         """Return the wheel speeds in a plain line without its end. Raises `FrameError`."""
-        match = _LINE.fullmatch(line)
-        if match is None:
-            raise FrameError("malformed", line)
-        a, of_a, b, of_b, c, of_c, d, of_d = match.groups()
-        places, wheel = self._by_word, [math.inf] * 4
-        index, sign = places[a]
-        wheel[index] = sign * float(of_a)
-        index, sign = places[b]
-        wheel[index] = sign * float(of_b)
-        index, sign = places[c]
-        wheel[index] = sign * float(of_c)
-        index, sign = places[d]
-        wheel[index] = sign * float(of_d)
-        if max(wheel) > MAX_SPEED or min(wheel) < -MAX_SPEED:
-            raise FrameError("duplicate_wheel" if math.inf in wheel else "over_range", line)
-        front_right, front_left, rear_left, rear_right = wheel
-        return WheelSpeeds(front_right, front_left, rear_left, rear_right)
+        return WheelSpeeds(*self.wheels(self._line.decode(line)))
 
 
 def _token(letter: str, speed: float) -> str:

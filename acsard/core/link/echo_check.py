@@ -11,6 +11,7 @@ motor is that of a line.
 
 from __future__ import annotations
 
+import re
 from typing import Literal
 
 from msgspec import Struct
@@ -31,9 +32,7 @@ RETURNED_FRACTION = 0.9
 # In a row, in which a board without encoders repeats the begin or the end of a ramp.
 SET_POINT_WINDOWS = 3
 
-_SPEEDS = 31  # bytes of a line without its checksum
-
-_NO_SPEED = b"abcdpn0.,"  # of these bytes is the line of zeros
+_SPEED = re.compile(rb"[1-9]")  # in the part of a line before its checksum
 
 
 class EchoCheck(Struct):
@@ -76,7 +75,7 @@ class EchoCheck(Struct):
         before, self.last = self.last, ""
         if line + b"\r\n" in written:
             self.repeated += 1
-            speeds, self.speeds = self.speeds, line[:_SPEEDS]
+            speeds, self.speeds = self.speeds, line.partition(b"#")[0]
             changed = bool(speeds) and speeds != self.speeds
             self.changes += changed
             self.last = "other" if changed else "equal"
@@ -111,7 +110,7 @@ class EchoCheck(Struct):
         changes, turns = self.changes, self.turns
         suspect = 0 < least <= self.repeated
         self._begin(now_ns, written)
-        known, self.steady = self.steady, suspect and bool(self.speeds.strip(_NO_SPEED))
+        known, self.steady = self.steady, suspect and _SPEED.search(self.speeds) is not None
         if not suspect:
             self.windows = 0
             return

@@ -13,7 +13,7 @@ from msgspec import Struct, field
 
 from acsard.core.codes import CODES, Reason, sentence
 from acsard.core.formatting import many, printable_bytes
-from acsard.core.link.codec import TOKENS
+from acsard.core.link.codec import SPEED
 from acsard.core.link.link_setup import LinkSetup
 from acsard.core.link.link_state import Link, LinkState
 from acsard.core.link.step_times import StepTimes
@@ -37,21 +37,30 @@ MAX_SHOWN_BYTES = 64  # a complete line and some noise
 # pieces of valid lines, or no line ends. foreign: valid lines within other bytes. garbage: nothing
 # like a line. few: good lines, and bad ones. sparse: too few lines.
 ReceivedCode = Literal[
-    "received_nothing", "received_statuses", "received_text", "received_form", "received_cut",
-    "received_foreign", "received_garbage", "received_few", "received_sparse",
+    "received_nothing", "received_statuses", "received_text", "received_form", "received_letters",
+    "received_cut", "received_foreign", "received_garbage", "received_few", "received_sparse",
 ]  # fmt: skip
 
 CHECKED_FIRMWARE = ', does its firmware support mcu.link_check = "on" (else write "off")'
 
-_RIGHT = re.compile(TOKENS)
-# Each byte has one place in it, so that no line makes the search for a match long.
-_OTHER_FORM = re.compile(
-    rb"[abcd][: =]*(?:[pn+-] *)?(?:[0-9]+(?:\.[0-9]+)?|\.[0-9]+)[,; \t]*" * 4, re.IGNORECASE
-)
+# Of any motors: which ones a robot has is declared.
+_LETTER = rb"[a-moq-z]"
+_VALUES = _LETTER + rb"[pn]" + SPEED + rb"(?:, *" + _LETTER + rb"[pn]" + SPEED + rb"){1,3}"
+_RIGHT = re.compile(_VALUES)
+_OTHER_LETTERS = re.compile(_VALUES + rb"(?:, *)?(?:#[0-9A-F@*]*)?")
+# By the number of motors. Each byte has one place in it, so that no line makes the search for a
+# match long.
+_OTHER_FORMS = {
+    motors: re.compile(
+        (_LETTER + rb"[: =]*(?:[pn+-] *)?(?:[0-9]+(?:\.[0-9]+)?|\.[0-9]+)[,; \t]*") * motors,
+        re.IGNORECASE,
+    )
+    for motors in (2, 4)
+}
 _WORD = re.compile(rb"[A-Za-z]{3}")
-_VALUE = re.compile(rb"(?<![A-Za-z])[abcd][pn] *[0-9]+\.[0-9]")
+_VALUE = re.compile(rb"(?<![A-Za-z])" + _LETTER + rb"[pn] *[0-9]+\.[0-9]")
 # Only characters that a reply can contain.
-_PIECE = re.compile(rb"[abcdpn0-9A-F., #@*\r\n]+")
+_PIECE = re.compile(rb"[a-z0-9A-F., #@*\r\n]+")
 
 
 def is_text(line: bytes) -> bool:
@@ -82,6 +91,7 @@ class Traffic(Struct):
     statuses: int = 0
     texts: int = 0  # bad lines for which `is_text` holds
     formed: int = 0  # bad lines that are replies in another form
+    lettered: int = 0  # bad lines that are replies of other motors
     last: bytes = b""  # last bad line, or incomplete bytes
     late_s: float = 0.0  # longest time in which this computer did not run the daemon
 
@@ -91,14 +101,17 @@ class Traffic(Struct):
         if not self.lines:
             self.last = (self.last + data)[-MAX_SHOWN_BYTES:]
 
-    def line(self, line: bytes, good: bool) -> None:
-        """Add a line without its end; `good` if it is a valid reply."""
+    def line(self, line: bytes, good: bool, motors: int) -> None:
+        """Add a line without its end; `good` if it is a valid reply of so many motors."""
         self.lines += 1
         self.good += good
         if not good:
             self.last = line
             self.texts += is_text(line)
-            self.formed += _OTHER_FORM.fullmatch(line) is not None
+            if _OTHER_LETTERS.fullmatch(line):
+                self.lettered += 1
+            elif _OTHER_FORMS[motors].fullmatch(line):
+                self.formed += 1
 
     @property
     def code(self) -> ReceivedCode:
@@ -111,6 +124,8 @@ class Traffic(Struct):
             return "received_text"
         if 2 * self.formed > bad:
             return "received_form"
+        if 2 * self.lettered > bad:
+            return "received_letters"
         if self.good:
             return "received_few" if bad else "received_sparse"
         if self.lines and _RIGHT.search(self.last):

@@ -10,7 +10,7 @@ import math
 from msgspec import Struct
 
 from acsard.core.config.settings import MAX_REPLY_PERIOD_S, FeedbackConfig, McuConfig
-from acsard.core.config.wire_time import PLAIN_BYTES, wire_ns
+from acsard.core.config.wire_time import plain_bytes, wire_ns
 from acsard.core.link.checked_line import SAMPLE_REQUEST
 from acsard.core.link.codec import Codec
 from acsard.core.values import NS_PER_S, Ns
@@ -59,7 +59,7 @@ class LinkSetup(Struct, frozen=True):
             rest=codec.stop.rstrip(b",\r\n"),
             period_ns=0 if mcu.checked else round(NS_PER_S * mcu.reply_period),
             command_interval_ns=command_interval_ns,
-            soonest_ns=wire_ns(2 * PLAIN_BYTES, mcu.baud_rate),
+            soonest_ns=wire_ns(2 * plain_bytes(len(codec.letters)), mcu.baud_rate),
             quiet_ns=quiet_ns,
             late_step_ns=LATE_STEP_FRACTION * quiet_ns,
             count=math.tau / counts if counts else 0.0,

@@ -222,7 +222,7 @@ class McuSession(Struct):
     def encoder_counts(self, setup: LinkSetup) -> tuple[int, ...]:
         """Return the declared counts per turn of each wheel; 0 if the speeds contradict them."""
         agree = self._timeline.whole.misfit < MAX_MISFIT
-        return (setup.mcu.encoder_counts if agree else 0,) * 4
+        return (setup.mcu.encoder_counts if agree else 0,) * len(setup.codec.letters)
 
     def asks(self, at_ns: Ns) -> None:
         """Wait for the answer to the question, and count no line before it."""
@@ -351,7 +351,7 @@ class McuSession(Struct):
             else:
                 feedback.append(reply)
             if link.state != "up":
-                self._silence.now.line(line, reply is not None)
+                self._silence.now.line(line, reply is not None, len(setup.codec.letters))
         return feedback
 
     def _without_remarks(
@@ -397,7 +397,7 @@ class McuSession(Struct):
         reading, asked_ns, at_ns, timeline = None, None, read_at.mono_ns, self._timeline
         try:
             if setup.checked:
-                reply = unseal(line)
+                reply = unseal(line, len(setup.codec.letters))
                 speeds, reading = setup.codec.decode(reply.plain), reply.reading
                 asked_ns = out.find(reply, at_ns)
             else:

@@ -39,7 +39,6 @@ from acsard.core.motion.emergency_stop import (
 )
 from acsard.core.motion.gyro import STATUS_TEXTS
 from acsard.core.values import (
-    WHEELS,
     GyroDoes,
     Instant,
     Recording,
@@ -179,7 +178,7 @@ def _check(config: Config) -> str:
 def _serial_link(config: Config, snapshot: Snapshot) -> Row:
     mcu, state = config.mcu, snapshot.state
     use = wire_use(config.rate_hz, mcu.baud_rate, mcu.line_bytes)
-    named = zip(WHEELS, state.encoder_counts, strict=False)
+    named = zip(config.mcu.wheels.names, state.encoder_counts, strict=False)
     values = {"port": mcu.port, "wire_use": f"{use:.2f}", "check": snapshot.check}
     if _is_reason(state):
         values["code"] = state.code

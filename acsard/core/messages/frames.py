@@ -118,7 +118,7 @@ def tf_numbers(estimate: Estimate) -> Numbers:
     return (sec, nanosec, pose.x, pose.y, math.sin(half), math.cos(half))
 
 
-def wheel_states_numbers(estimate: Estimate) -> Numbers:
-    speeds = estimate.speeds
+def wheel_states_numbers(wheels: int, estimate: Estimate) -> Numbers:
+    angles, speeds = estimate.positions[:wheels], estimate.speeds.as_tuple()[:wheels]
     sec, nanosec = divmod(estimate.at.wall_ns, NS_PER_S)
-    return (sec, nanosec, *estimate.positions, *speeds.as_tuple())
+    return (sec, nanosec, *angles, *speeds)

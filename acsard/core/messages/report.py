@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Collection, Mapping
+from functools import partial
 
 from msgspec.structs import replace
 
@@ -114,15 +115,16 @@ class Report:
         # Expiry by owner, "" for the robot's own (maybe by the TLS gateway's report), ns since
         # 1970.
         self.certificate_ends = dict(certificate_ends or {})
-        self._names = list(config.joints.as_tuple())
+        self._names = list(config.joint_names)
         self._start, self._version = start, version
+        angles_and_speeds = partial(wheel_states_numbers, len(self._names))
         self._estimate: Estimate | None = None
         self._now: Instant | None = None  # of the last wake-up
         self._happened = RecentEvents()
         self._feedback = (
             FeedbackTopic("odom", self._odom, odom_numbers),
             FeedbackTopic("tf", self._tf, tf_numbers),
-            FeedbackTopic("wheel_states", self._wheel_states, wheel_states_numbers),
+            FeedbackTopic("wheel_states", self._wheel_states, angles_and_speeds),
         )
         # Builders by key; also due with `status_changed`.
         self._summaries: dict[str, BuildSummary] = {
@@ -290,8 +292,8 @@ class Report:
         return JointState(
             header=Header(Time.from_ns(estimate.at.wall_ns)),
             name=self._names,
-            position=list(estimate.positions),
-            velocity=list(estimate.speeds.as_tuple()) if live else [],
+            position=list(estimate.positions[: len(self._names)]),
+            velocity=list(estimate.speeds.as_tuple()[: len(self._names)]) if live else [],
         )
 
     def _cmd_vel_out(self, now: Instant, applied: BodyTwist) -> TwistStamped:

@@ -413,7 +413,8 @@ class RobotState(Message, frozen=True):
     angular: float | None
     """Measured turn rate, rad/s, left is positive; null without feedback."""
     wheels: list[float]
-    """Measured speeds, rad/s, in the order front right, front left, rear left, rear right."""
+    """Measured speeds, rad/s, in the order front right, front left, rear left, rear right; if two
+    wheels are driven: right, left."""
     link: Annotated[str, one_of(get_args(LinkState))]
     """State of the serial link to the board."""
     source: str

@@ -22,11 +22,15 @@ NO_ENCODERS = "feedback.encoders = false: the pose is what was commanded"
 class ConsistencyChecks(Struct):
     """All consistency checks of one robot."""
 
-    wheels: Wheels = field(default_factory=new_wheels)
+    wheels: Wheels
     gyro: Gyro = field(default_factory=Gyro)  # not used without `odometry.gyro`
     turn: Turn | None = None  # turn of the last line by the gyro; None: use the wheels
     slips: bool = False  # the wheels contradict each other or the gyro
     events: tuple[Event, ...] = ()  # of the last line
+
+    @classmethod
+    def initial(cls, model: ErrorModel) -> ConsistencyChecks:
+        return cls(new_wheels(model.independent))
 
     def wheels_status(self, feedback: FeedbackConfig) -> WheelsStatus:
         return self.wheels.status if feedback.encoders else WheelsStatus(NO_ENCODERS)

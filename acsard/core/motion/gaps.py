@@ -45,9 +45,11 @@ class Rolled(Struct, frozen=True, gc=False):
     unknown: Seconds  # in addition to `seconds`
 
 
-def rolled_over(skipped: Skipped, line: Line, before: Wheels4) -> Rolled:
+def rolled_over(skipped: Skipped, line: Line, before: Wheels4, independent: int) -> Rolled:
     """Return the angles since the last plausible line, which had the speeds `before`, rad/s."""
-    speeds = _confirmed(before, line.speeds.as_tuple())
+    speeds = line.speeds.as_tuple()
+    if independent == 4:
+        speeds = _confirmed(before, speeds)
     if line.turned is not None:
         seconds, filled, unknown, angles = line.dt, 0.0, 0.0, line.turned
     else:
@@ -66,7 +68,8 @@ def rolled_over(skipped: Skipped, line: Line, before: Wheels4) -> Rolled:
 
 def _confirmed(before: Wheels4, after: Wheels4) -> Wheels4:
     # Motion changes both wheels of a side alike, damage one of them. In a usual line it matters
-    # little; here, take the median of each wheel, the other one of its side and its last speed.
+    # little; here, take the median of each wheel, the other one of its side and its last speed. If
+    # each wheel is alone on its side, there are only two values, and neither outvotes the other.
     fr, fl, rl, rr = after
     was_fr, was_fl, was_rl, was_rr = before
     return (

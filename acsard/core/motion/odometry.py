@@ -80,7 +80,9 @@ class Odometry(Struct):
         speeds, wheels, gap = line.speeds, checks.wheels, None
         reported, seconds = speeds.as_tuple(), line.dt
         if line.bridged or line.gap or self.skipped.lines or seconds > LONG_S:
-            gap, self.skipped = rolled_over(self.skipped, line, self.speeds.as_tuple()), Skipped()
+            before = self.speeds.as_tuple()
+            gap = rolled_over(self.skipped, line, before, model.independent)
+            self.skipped = Skipped()
             rolled, seconds = gap.angles, gap.seconds
         else:
             rolled = line.by_counts or times(reported, seconds)
@@ -105,7 +107,7 @@ class Odometry(Struct):
         if turn is not None:
             angle, angular, variance = turn.angle, turn.rate, turn.variance
         self.travelled += abs(distance)
-        before, self.twist, self.speeds = self.twist, Twist(linear, angular), speeds
+        last, self.twist, self.speeds = self.twist, Twist(linear, angular), speeds
 
         pose, path, uncertainty = self.pose, self.path, self.uncertainty
         state = at_rest, slips, turn is not None
@@ -135,7 +137,7 @@ class Odometry(Struct):
                 self.was_set = False
                 uncertainty.doubt((distance / 2) ** 2, (angle / 2) ** 2, 0.0, heading)
             if gap and not (rested and line.driven <= 0.0):
-                self._doubt_gap(gap, before, turn is not None, heading, model)
+                self._doubt_gap(gap, last, turn is not None, heading, model)
             if line.doubt is not None:
                 distance, angle = model.kinematics.moved(line.doubt)
                 uncertainty.miss("gap", distance, 0.0 if turn is not None else angle, heading)

@@ -17,7 +17,7 @@ from msgspec import Struct
 
 from acsard.core.link.coarse_encoders import COARSEST_COUNT, JUMP_ANGLE, JUMP_SPEED, MIN_COUNT_S
 from acsard.core.link.feedback import Line
-from acsard.core.values import WHEELS, Event, RadPerS, Wheels4, WheelSpeeds
+from acsard.core.values import Event, RadPerS, Wheels4, WheelSpeeds
 
 FAULT_LINES = 3  # in a row: 30 ms at 100 Hz
 
@@ -67,9 +67,10 @@ class Sanity(Struct):
         """Whether the last `FAULT_LINES` lines were impossible, which latches a fault."""
         return self.count >= FAULT_LINES
 
-    def impossible(self, line: Line, fastest: RadPerS) -> str:
-        """Return why no wheel can have these speeds, or ""; `fastest` is `feedback.wheel_speed`.
+    def impossible(self, line: Line, fastest: RadPerS, names: tuple[str, ...]) -> str:
+        """Return why no wheel can have these speeds, or "".
 
+        `fastest` is `feedback.wheel_speed`, and `names` are those of the driven wheels.
         The allowed change grows with the time since the last possible line, so a real jump is
         accepted in time. Updates `failed` and `warning`.
         """
@@ -91,11 +92,11 @@ class Sanity(Struct):
         over = beyond is not NOT_FAST or max(map(abs, wheels)) > fastest
         if over or (sudden and change > self._most(self.since, longest)):
             most = self._most(self.since, longest)
-            why = self._too_fast(line, fastest)
+            why = self._too_fast(line, fastest, names)
             if not why and last is not None:
-                why = self._jump(line, last, most)
+                why = self._jump(line, last, most, names)
                 if why:
-                    agrees = not self.trusted and self._agrees(line, longest)
+                    agrees = not self.trusted and self._agrees(line, longest, names)
                     self.rejected = [*self.rejected[1 - FAULT_LINES :], (speeds, self.since)]
                     why = "" if agrees else why
         self.lines += 1
@@ -124,9 +125,9 @@ class Sanity(Struct):
         mean = (since + longest) / 2
         return MAX_WHEEL_ACCELERATION * (mean if mean > since else since) + SPEED_MARGIN
 
-    def _agrees(self, line: Line, longest: float) -> bool:
+    def _agrees(self, line: Line, longest: float, names: tuple[str, ...]) -> bool:
         return any(
-            not self._jump(line, speeds, self._most(self.since - since, longest))
+            not self._jump(line, speeds, self._most(self.since - since, longest), names)
             for speeds, since in self.rejected
         )
 
@@ -139,7 +140,7 @@ class Sanity(Struct):
             'supports mcu.link_check = "on" protects each line with a checksum'
         )
 
-    def _too_fast(self, line: Line, fastest: RadPerS) -> str:
+    def _too_fast(self, line: Line, fastest: RadPerS, names: tuple[str, ...]) -> str:
         turned, own = line.by_counts, line.dt - line.bridged
         usual = max(own, MIN_COUNT_S)
         known = line.step < math.inf
@@ -161,15 +162,15 @@ class Sanity(Struct):
                     time = abs(turned[wheel]) / size  # in which the board has counted
             over = beyond[wheel] = max(0.0, beyond[wheel] + (size - fastest) * (time + dropped_s))
             if size > fastest and (over > count or not (known or size <= most)):
-                return f"{WHEELS[wheel]} at {now:.2f} rad/s is over feedback.wheel_speed"
+                return f"{names[wheel]} at {now:.2f} rad/s is over feedback.wheel_speed"
         a, b, c, d = beyond
         self.beyond = (a, b, c, d) if any(beyond) else NOT_FAST
         return ""
 
-    def _jump(self, line: Line, before: WheelSpeeds, most: float) -> str:
+    def _jump(self, line: Line, before: WheelSpeeds, most: float, names: tuple[str, ...]) -> str:
         least = line.count / MIN_INTERVAL_S if line.by_counts is not None else 0.0
         most += COUNT_MARGIN * max(line.step, least)
-        rows = zip(WHEELS, line.speeds.as_tuple(), before.as_tuple(), strict=True)
+        rows = zip(names, line.speeds.as_tuple(), before.as_tuple(), strict=False)
         for name, now, then in rows:
             if abs(now - then) > most:
                 leap = f"{name} jumps from {then:.2f} to {now:.2f} rad/s"

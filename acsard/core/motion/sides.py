@@ -58,7 +58,7 @@ class Block(NamedTuple):
 
 class Side(Struct):
     name: SideName
-    front: int  # its wheels, by `WHEELS`
+    front: int  # its wheels, by `WHEELS`; equal if it has only one
     rear: int
     command: RadPerS = 0.0
     expected: RadPerS = 0.0

@@ -26,6 +26,7 @@ from acsard.core.motion.agreement import claims
 from acsard.core.motion.kinematics import Kinematics
 from acsard.core.motion.wheels import count_angle
 from acsard.core.values import (
+    WHEELS,
     Metres,
     Pose,
     PoseCovariance,
@@ -82,8 +83,11 @@ class ErrorModel:
         counts: int = 0,
         limits: LimitsConfig = LimitsConfig(),  # noqa: B008
         feedback: FeedbackConfig = FeedbackConfig(),  # noqa: B008
+        names: tuple[str, ...] = WHEELS,
     ) -> None:
-        # `counts` per revolution is 0 if unknown.
+        # `counts` per revolution is 0 if unknown. `names` are those of the driven wheels.
+        self.names = names
+        self.independent = independent = len(names)  # wheels: of two, the rear is the front
         track, radius = kinematics.track, kinematics.radius
         self.kinematics, self.track = kinematics, track
         self.count: Rad = math.tau / counts if counts else 0.0
@@ -94,8 +98,10 @@ class ErrorModel:
         self.play: Rad = count / track
         # A wheel at rest rocks between the edges of a count.
         self.unsettled: Rad = 2 * math.tau / (counts or ASSUMED_COUNTS)
-        # Where in a count each wheel was at the start, and is now.
-        xy, yaw = (count**2 / 24, count**2 / 6 / track**2) if counts else (0.0, 0.0)
+        # Where in a count each wheel was at the start, and is now. A turn is the difference of the
+        # sides' means, the distance half of their sum.
+        xy = count**2 / (6 * independent) if counts else 0.0
+        yaw = 4 * xy / track**2
         xy, yaw = START_VARIANCE + xy, START_VARIANCE + yaw
         self.start = PoseCovariance(xy, 0.0, 0.0, xy, 0.0, yaw)
 
@@ -119,8 +125,10 @@ class ErrorModel:
         self.effects: tuple[list[Effect], list[Effect]] = by_wheels + missed, by_gyro + missed
         self.bending = [k for k in PARAMETERS if any(by_wheels[k]) or any(by_gyro[k])]
 
-        # Four independent errors of the speeds; each side is the mean of two wheels.
-        self.of_speed = radius**2 / 48, radius**2 / track**2 / 12
+        # Independent errors of the speeds; each side is the mean of its wheels.
+        self.of_speed = (
+            radius**2 / (12 * independent), radius**2 / track**2 / (3 * independent),
+        )  # fmt: skip
         self.speed = Twist(limits.linear_speed, limits.angular_speed)
         self.acceleration = Twist(
             max(limits.linear_acceleration, limits.linear_deceleration),
@@ -149,7 +157,7 @@ class ErrorModel:
         """
         speed, acceleration = self.speed, self.acceleration
         short = min(seconds, MAX_FILLED_GAP_S)  # then the robot was stopped
-        quantum = 2 * (self.unsettled / 2 / period * short) ** 2
+        quantum = self.independent / 2 * (self.unsettled / 2 / period * short) ** 2
         along = min(acceleration.linear * short / 4, speed.linear) * short
         yaw = min(acceleration.angular * short / 4, speed.angular) * short
         return along**2 + self.of_speed[0] * quantum, yaw**2 + self.of_speed[1] * quantum

@@ -5,6 +5,9 @@ is summed to an angle (`Wheel.off`), which leaks only while both agree. Beyond 1
 wheel that came no nearer to its command for three response times does not obey it: a fault if it
 rolls on, too far or the wrong way, else a warning. `sides.py` compares the two wheels of a side. A
 line only adds its angles: all else runs on the sums of `BLOCK_S`.
+
+If two wheels are driven, nothing is compared on a side: a faulty encoder shows only by the command
+and by a gyro.
 """
 
 from __future__ import annotations
@@ -30,6 +33,7 @@ from acsard.core.motion.sides import (
 )
 from acsard.core.values import (
     STILL,
+    TWO_WHEELS,
     WHEELS,
     Event,
     Rad,
@@ -38,6 +42,7 @@ from acsard.core.values import (
     Wheels4,
     WheelSpeeds,
     WheelsStatus,
+    wheel_names,
 )
 
 BLOCK_S = 0.05
@@ -105,9 +110,9 @@ class Wheel(Struct):
 
 
 class Wheels(Struct):
-    """The verdicts on four wheels. `add` takes each line; `fault`, `events`, `pushed` are of it."""
+    """The verdicts on the wheels. `add` takes each line; `fault`, `events`, `pushed` are of it."""
 
-    wheels: tuple[Wheel, Wheel, Wheel, Wheel]
+    wheels: tuple[Wheel, ...]  # four, or two
     sides: tuple[Side, Side]
     # Commanded speeds; the caller sets these three. None: the emergency stop may cut the power.
     commanded: WheelSpeeds | None = STILL
@@ -205,11 +210,16 @@ class Wheels(Struct):
         return found
 
     @property
+    def names(self) -> tuple[str, ...]:
+        return wheel_names(len(self.wheels))
+
+    @property
     def status(self) -> WheelsStatus:
         out = [side for side in self.sides if side.out >= 0]
         slipping = [side for side in self.sides if side.slip_s]
         texts = [side.out_text for side in out] + [side.slip_text for side in slipping]
-        texts += [_text(wheel, i) for i, wheel in enumerate(self.wheels) if wheel.warning]
+        named = zip(self.names, self.wheels, strict=True)
+        texts += [_text(wheel, name) for name, wheel in named if wheel.warning]
         excluded, names = [WHEELS[side.out] for side in out], [side.name for side in slipping]
         return WheelsStatus("; ".join(texts), tuple(excluded), tuple(names))
 
@@ -236,7 +246,7 @@ class Wheels(Struct):
         block = Block(s, angles, line, speeds, count, limit, patience, rest)
         if commanded is None:
             self._drop()
-            for wheel, angle in zip(self.wheels, angles, strict=True):
+            for wheel, angle in zip(self.wheels, angles, strict=False):
                 _rest(wheel, angle, block)
         else:
             left, right = self.sides
@@ -347,7 +357,7 @@ class Wheels(Struct):
             or turning * command >= 0
         ):
             return False
-        names = f"{WHEELS[i]} and {WHEELS[ACROSS[i]]}"
+        names = f"{self.names[i]} and {self.names[ACROSS[i]]}"
         figures = (
             f"(commanded {one.command:.2f} and {other.command:.2f}, "
             f"measured {one.speed:.2f} and {other.speed:.2f} rad/s)"
@@ -356,7 +366,7 @@ class Wheels(Struct):
         return True
 
     def _latch(self, code: Code, i: int, command: RadPerS) -> None:
-        wheel, name = self.wheels[i], WHEELS[i]
+        wheel, name = self.wheels[i], self.names[i]
         if self.fault is None:
             figures = f"(commanded {command:.2f}, measured {wheel.speed:.2f} rad/s)"
             self.fault = joined(reason(code, part=name, wheel=name, figures=figures))
@@ -368,10 +378,11 @@ class Wheels(Struct):
             return
         wheel.warning = code
         if code is None:
-            text = f"{WHEELS[i]} wheel obeys its command again"
+            text = f"{self.names[i]} wheel obeys its command again"
             event = Event("wheel_fault", text, kind="again")
         else:
-            event = Event("wheel_fault", _text(wheel, i), "warning", kind=code, code=code)
+            text = _text(wheel, self.names[i])
+            event = Event("wheel_fault", text, "warning", kind=code, code=code)
         self.events = (*self.events, event)
 
     def _miss(self, count: Rad, patience: Seconds) -> None:
@@ -383,11 +394,13 @@ class Wheels(Struct):
                 continue
             if one.away_s >= patience and other.away_s >= patience:
                 values = [0.0] * 4
-                values[side.front], values[side.rear] = one.missed, other.missed
+                values[side.front], values[3 - side.front] = one.missed, other.missed
                 one.missed = other.missed = 0.0
                 self.missed = (*self.missed, (side.name, _wheels4(values)))
 
     def _compare(self, block: Block, kinematics: Kinematics) -> None:
+        if len(self.wheels) < len(WHEELS):
+            return
         s, angles, count = block.s, block.angles, block.unit
         keep = 1.0 / (1.0 + s / (PARTNER_S + PARTNER_S_PER_RAD * count))
         left, right = self.sides
@@ -414,9 +427,11 @@ class Wheels(Struct):
         self.slips = self.excludes or left.slip_s > 0.0 or right.slip_s > 0.0
 
 
-def new_wheels() -> Wheels:
-    sides = Side("left", front=1, rear=2), Side("right", front=0, rear=3)
-    return Wheels((Wheel(), Wheel(), Wheel(), Wheel()), sides)
+def new_wheels(independent: int) -> Wheels:
+    """Return the state for four wheels, or for two, of which each is alone on its side."""
+    alone = independent == len(TWO_WHEELS)
+    sides = Side("left", 1, 1 if alone else 2), Side("right", 0, 0 if alone else 3)
+    return Wheels(tuple([Wheel() for _ in range(independent)]), sides)
 
 
 def count_angle(counts: int) -> Rad:
@@ -483,7 +498,7 @@ def _wheels4(values: list[float]) -> Wheels4:
     return front_right, front_left, rear_left, rear_right
 
 
-def _text(wheel: Wheel, i: int) -> str:
+def _text(wheel: Wheel, name: str) -> str:
     assert wheel.warning is not None
     share = wheel.speed / wheel.expected if wheel.expected else 0.0
-    return joined(reason(wheel.warning, wheel=WHEELS[i], share=f"{share:.0%}")).text
+    return joined(reason(wheel.warning, wheel=name, share=f"{share:.0%}")).text

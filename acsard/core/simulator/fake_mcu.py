@@ -63,8 +63,16 @@ class FakeMcu:
 
     def __init__(self, config: Config, now_ns: Ns = 0) -> None:
         self._vehicle = Vehicle(config.sim, config.drive)
+        self.letters = config.mcu.wheels.letters
+        motors = self._motors = len(self.letters)
         self.switches = Switches(
-            config.mcu.baud_rate, bumpers="." * (len(config.safety.bumpers) or 4)
+            config.mcu.baud_rate,
+            bumpers="." * (len(config.safety.bumpers) or 4),
+            gains=(1.0,) * motors,
+            drivers=tuple(range(motors)),
+            drives=(1.0,) * motors,
+            encoders=tuple(range(motors)),
+            encoder_signs=(1,) * motors,
         )
         self._passed = {"reply": 0, "command": 0, "bit": 0}  # for faults of every n-th
         self._counts = config.sim.encoder_counts
@@ -79,11 +87,11 @@ class FakeMcu:
         self._fed_ns = now_ns
         self._on_ns = now_ns
         self._angles: list[float] = []
-        self._seen: list[int] = []  # counts of the motors a to d at `self._angles`
+        self._seen: list[int] = []  # counts of the motors at `self._angles`
         self._window = (now_ns, self._encoders())
-        self._measured = [0.0] * 4
-        self._moved = [0] * 4
-        self._counted = [0.0] * 4
+        self._measured = [0.0] * motors
+        self._moved = [0] * motors
+        self._counted = [0.0] * motors
         self._replied_ns = now_ns - NS_PER_S
         # Lines of the host with the time of their last byte, valid or not, obeyed or not.
         self.heard: deque[tuple[int, bytes]] = deque(maxlen=4096)
@@ -92,7 +100,7 @@ class FakeMcu:
         self._checks = False  # the host has sent a valid checksum: status lines have one, too
         self._lasting = ExitStack()
         for text in config.sim.faults:
-            self._lasting.enter_context(self.fault(*parse(text)))
+            self._lasting.enter_context(self.fault(*parse(text, self.letters)))
 
     @property
     def vehicle(self) -> Vehicle:
@@ -162,7 +170,7 @@ class FakeMcu:
         self._boot_until_ns = now_ns + deaf_ns
         self._on_ns = now_ns + deaf_ns
         self._window = (now_ns, self._encoders())
-        self._measured, self._counted = [0.0] * 4, [0.0] * 4
+        self._measured, self._counted = [0.0] * self._motors, [0.0] * self._motors
         self._schedule(now_ns + deaf_ns // 2, "sent", b"\x00\xf8\xff~boot\r\n")
         self._schedule(now_ns + deaf_ns, "booted", b"")
         self._checks = False
@@ -221,8 +229,9 @@ class FakeMcu:
         set_points = self.vehicle.set_points
         for output, value in command.values.items():
             motor = self.switches.drivers[output]
-            wheel, forward = self._wiring[motor]
-            set_points[wheel] = forward * self.switches.drives[motor] * value
+            wheels, forward = self._wiring[motor]
+            for wheel in wheels:
+                set_points[wheel] = forward * self.switches.drives[motor] * value
         self.valid_lines += 1
         self._fed_ns = now_ns
         if "report" not in self.switches.clocks:
@@ -230,7 +239,7 @@ class FakeMcu:
 
     def understand(self, line: bytes) -> protocol.BoardCommand | None:
         """Decode a line of the host as the firmware does."""
-        return protocol.DECODERS[self.switches.firmware](line)
+        return protocol.DECODERS[self.switches.firmware](line, self.letters)
 
     def _send_identity(self, now_ns: Ns) -> None:
         switches = self.switches
@@ -247,7 +256,10 @@ class FakeMcu:
         self._replied_ns = now_ns
         comma, end = switches.ending[:-2].encode(), switches.ending[-2:].encode()
         speeds = tuple(self._speeds(now_ns))
-        text = protocol.speeds_text(speeds, switches.separator, switches.unpadded_replies) + comma
+        text = protocol.speeds_text(
+            self.letters, speeds, switches.separator, switches.unpadded_replies
+        )
+        text += comma
         if command.sequence:
             self._checks = True
             sample = self._sample() if command.wants_sample and switches.samples else ()
@@ -287,7 +299,7 @@ class FakeMcu:
         if angles != self._angles:
             floor, tau, per_turn = math.floor, math.tau, self._counts
             self._angles = angles.copy()
-            self._seen = [floor(f * angles[w] / tau * per_turn + 0.5) for w, f in self._wiring]
+            self._seen = [floor(f * angles[w[0]] / tau * per_turn + 0.5) for w, f in self._wiring]
         return self._seen
 
     def _speeds(self, now_ns: Ns) -> list[float]:
@@ -299,9 +311,9 @@ class FakeMcu:
             counts = self._encoders()
             if counts == before and switches.frozen is None:
                 # No motor has turned by a count, so wrong gains and swapped wires have no effect.
-                self._moved, self._measured = [0] * 4, [0.0] * 4
+                self._moved, self._measured = [0] * self._motors, [0.0] * self._motors
                 self._window = (now_ns, counts)
-                return [0.0] * 4
+                return [0.0] * self._motors
             scale = math.tau / self._counts * NS_PER_S / (now_ns - since)
             every = [b - a for a, b in zip(before, counts, strict=True)]
             signs = switches.encoder_signs
@@ -320,7 +332,7 @@ class FakeMcu:
         return [speed if abs(speed) >= 0.005 else 0.0 for speed in speeds]
 
     def _sample(self) -> tuple[int, ...]:
-        # ms since boot, and the four counts
+        # ms since boot, and the counts
         read_ns, _ = self._window
         return (read_ns - self._on_ns) // MS, *(round(count) for count in self._counted)
 
@@ -405,8 +417,11 @@ class FakeMcu:
         return max(now_ns, now_ns // every_ns * every_ns + self.switches.stall_ns)
 
 
-def _wiring(wheels: WheelMap) -> list[tuple[int, int]]:
-    # For the motors a to d: an index in `WHEELS`, and -1 if a positive speed turns it backward.
-    motors = (wheels.front_right, wheels.front_left, wheels.rear_left, wheels.rear_right)
-    place = {motor[1]: (index, -1 if motor[0] == "-" else 1) for index, motor in enumerate(motors)}
-    return [place[letter] for letter in "abcd"]
+def _wiring(wheels: WheelMap) -> list[tuple[tuple[int, ...], int]]:
+    # For each motor: its wheel as an index in `WHEELS`, or those of its side if there are two
+    # motors, and -1 if a positive speed turns it backward.
+    place = {
+        motor[1]: ((n,) if len(wheels.motors) == 4 else (n, 3 - n), -1 if motor[0] == "-" else 1)
+        for n, motor in enumerate(wheels.motors)
+    }
+    return [place[letter] for letter in wheels.letters]

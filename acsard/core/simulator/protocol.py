@@ -13,71 +13,67 @@ from functools import lru_cache
 
 from msgspec import Struct
 
-MOTORS = "abcd"
-
 HEX = b"0123456789ABCDEF"
 
-_LINE = re.compile(rb"a([pn]\d\d\.\d\d),b([pn]\d\d\.\d\d),c([pn]\d\d\.\d\d),d([pn]\d\d\.\d\d),?")
-
-PLAIN_LENGTH = 31  # bytes, without a trailing comma and the line end
+VALUE_LENGTH = 8  # bytes, with the comma after the value
 
 
 class BoardCommand(Struct, frozen=True):
     """A valid command line from the host."""
 
-    values: dict[int, float]  # rad/s, by motor (0 to 3 for a to d)
+    values: dict[int, float]  # rad/s, by motor: its place among the board's letters
     sequence: bytes = b""  # two digits of a checked line
     wants_sample: bool = False  # the reply must contain the board's time and its encoder counts
 
 
-def reference(line: bytes) -> BoardCommand | None:
+def reference(line: bytes, letters: str) -> BoardCommand | None:
     """Decode a plain or checked line as the reference firmware does; None if it is not valid."""
     text = line.removesuffix(b"\n").removesuffix(b"\r")
     if b"#" not in text and b"*" not in text:
-        return _plain(text)
+        return _plain(text, letters)
     body, check = text[:-5], text[-5:]
     plain, _, suffix = body.partition(b"#")
     if check != b"*%04X" % _crc(body[len(plain) :], _crc_of_plain(plain)):
         return None
-    sequence, letters = suffix[:2], suffix[2:]
+    sequence, requests = suffix[:2], suffix[2:]
     if len(sequence) != 2 or any(digit not in HEX for digit in sequence):
         return None
-    if not all(0x47 <= letter <= 0x5A for letter in letters):  # G to Z
+    if not all(0x47 <= letter <= 0x5A for letter in requests):  # G to Z
         return None
-    command = _plain(plain)
-    return command and BoardCommand(command.values, sequence, b"S" in letters)
+    command = _plain(plain, letters)
+    return command and BoardCommand(command.values, sequence, b"S" in requests)
 
 
-def plain_only(line: bytes) -> BoardCommand | None:
+def plain_only(line: bytes, letters: str) -> BoardCommand | None:
     """Decode a line as firmware without checksums does; None if it is not plain."""
-    return _plain(line.removesuffix(b"\n").removesuffix(b"\r"))
+    return _plain(line.removesuffix(b"\n").removesuffix(b"\r"), letters)
 
 
-def prefix(line: bytes) -> BoardCommand | None:
-    """Decode a line and ignore all after the four speeds, as some firmware does, or return None."""
-    return _plain(line[:PLAIN_LENGTH])
+def prefix(line: bytes, letters: str) -> BoardCommand | None:
+    """Decode a line and ignore all after the speeds, as some firmware does, or return None."""
+    return _plain(line[: VALUE_LENGTH * len(letters) - 1], letters)
 
 
-def latched(line: bytes) -> BoardCommand:
+def latched(line: bytes, letters: str) -> BoardCommand:
     """Decode a line as old firmware does: obey each speed that is followed by a comma.
 
     The rest of the line need not be valid.
     """
-    values = {}
+    values, motors = {}, letters.encode()
     for token in line.split(b",")[:-1]:
         motor, sign = token[:1], token[1:2]
-        if motor and motor in MOTORS.encode() and sign in (b"p", b"n"):
+        if motor and motor in motors and sign in (b"p", b"n"):
             try:
                 value = float(token[2:])
             except ValueError:
                 continue
             if math.isfinite(value):
-                values[MOTORS.encode().index(motor)] = value if sign == b"p" else -value
+                values[motors.index(motor)] = value if sign == b"p" else -value
     return BoardCommand(values)
 
 
 # By firmware.
-DECODERS: dict[str, Callable[[bytes], BoardCommand | None]] = {
+DECODERS: dict[str, Callable[[bytes, str], BoardCommand | None]] = {
     "reference": reference,
     "plain_only": plain_only,
     "prefix": prefix,
@@ -85,15 +81,16 @@ DECODERS: dict[str, Callable[[bytes], BoardCommand | None]] = {
 }
 
 
-def _plain(text: bytes) -> BoardCommand | None:
-    values = _values(text)
+def _plain(text: bytes, letters: str) -> BoardCommand | None:
+    values = _values(text, letters)
     return None if values is None else BoardCommand(dict(enumerate(values)))
 
 
 # A robot at a constant speed gets the same values again and again, so they are cached.
 @lru_cache(256)
-def _values(text: bytes) -> tuple[float, ...] | None:
-    match = _LINE.fullmatch(text)
+def _values(text: bytes, letters: str) -> tuple[float, ...] | None:
+    values = ",".join([rf"{letter}([pn]\d\d\.\d\d)" for letter in letters])
+    match = re.fullmatch(values.encode() + b",?", text)
     return None if match is None else tuple(map(_value, match.groups()))
 
 
@@ -103,12 +100,12 @@ def _value(word: bytes) -> float:
 
 
 @lru_cache(1024)
-def speeds_text(speeds: tuple[float, ...], separator: str, unpadded: bool) -> bytes:
+def speeds_text(letters: str, speeds: tuple[float, ...], separator: str, unpadded: bool) -> bytes:
     """Return the plain part of a reply; unpadded speeds below ten have one integer digit."""
     form = "%s%s%.2f" if unpadded else "%s%s%05.2f"
     words = [
         form % (motor, "n" if speed < 0 else "p", min(abs(speed), 99.99))
-        for motor, speed in zip(MOTORS, speeds, strict=True)
+        for motor, speed in zip(letters, speeds, strict=True)
     ]
     return separator.join(words).encode()
 
@@ -116,14 +113,11 @@ def speeds_text(speeds: tuple[float, ...], separator: str, unpadded: bool) -> by
 def suffix(text: bytes, sequence: bytes, sample: Sequence[int]) -> bytes:
     """Return the suffix of a checked reply to the command with these two digits of `sequence`.
 
-    `sample` is the board's time in ms and the four counts, or empty.
+    `sample` is the board's time in ms and the counts, or empty.
     """
     body = b"#" + sequence
     if sample:
-        ms, a, b, c, d = sample
-        body += b"@%04X%04X%04X%04X%04X" % (
-            ms & 0xFFFF, a & 0xFFFF, b & 0xFFFF, c & 0xFFFF, d & 0xFFFF,
-        )  # fmt: skip
+        body += b"@" + b"".join([b"%04X" % (number & 0xFFFF) for number in sample])
     return body + b"*%04X" % _crc(body, _crc_of_plain(text))
 
 
