@@ -1,9 +1,9 @@
 """Sends speeds to the board that is checked, and stores its replies.
 
 A step of the check sends lines through a `Board`, and evaluates the stored `replies`. Speeds are
-those of the motors a to d, because the check must find out which wheel a motor turns. A step ends
-at once if a motor runs away, if the board falls silent (both end the check), or if it restarts. The
-caller implements `Wire` (the serial line) and `Operator` (the person).
+those of the motors by their letters, because the check must find out which wheel a motor turns. A
+step ends at once if a motor runs away, if the board falls silent (both end the check), or if it
+restarts. The caller implements `Wire` (the serial line) and `Operator` (the person).
 """
 
 from __future__ import annotations
@@ -15,18 +15,18 @@ from typing import Protocol
 from acsard.checkup import motion, outcomes
 from acsard.checkup.findings import StoppedError, WireLostError, motor_name, motor_names
 from acsard.checkup.lateness import HostDelays
-from acsard.checkup.motion import ZERO, BoardReply
+from acsard.checkup.motion import SPEED, BoardReply
 from acsard.checkup.repeats import Repeats
 from acsard.checkup.restarts import RestartedError, Restarts
-from acsard.core.config.settings import McuConfig, WheelMap
+from acsard.core.config.settings import McuConfig
 from acsard.core.config.wire_time import line_bytes, wire_ns
 from acsard.core.link.board_status import STATUS, decode_status
 from acsard.core.link.checked_line import SAMPLE_REQUEST, SEQUENCES, seal, unseal
-from acsard.core.link.codec import LETTERS, Codec, FrameError, Motors
+from acsard.core.link.codec import FrameError, MotorCodec, Motors
 from acsard.core.link.lines import LineReader
 from acsard.core.link.link_diagnosis import Traffic
 from acsard.core.link.link_state import WATCHDOG_S
-from acsard.core.values import NS_PER_S, WheelSpeeds
+from acsard.core.values import NS_PER_S
 
 
 class Wire(Protocol):
@@ -99,6 +99,8 @@ class Board:
 
     def __init__(self, wire: Wire, mcu: McuConfig, rate_hz: float, encoders: bool = True) -> None:
         self.wire, self.mcu, self.rate_hz = wire, mcu, rate_hz
+        self.letters = mcu.wheels.letters  # of the motors, which have the numbers from 0 on
+        self.zero = self.only(())
         self.repeats = Repeats(encoders)
         # Whether the check has seen all motors stand still. From then on, the check ends if a motor
         # runs away or if the board falls silent.
@@ -109,8 +111,8 @@ class Board:
         # Results of the steps
         self.baud_rate: int = mcu.baud_rate
         self.comma = mcu.trailing_comma  # whether the lines to the board end with a comma
-        # Whether motor d stops only if the line of zeros has the right ending: a comma if `comma`
-        # is true, else no comma.
+        # Whether the last motor stops only if the line of zeros has the right ending: a comma if
+        # `comma` is true, else no comma.
         self.latched = False
         # `sealed`: whether each line has a checksum. `sampled`: whether each line to the board
         # requests a sample, that is the board's clock and encoder counts.
@@ -142,7 +144,7 @@ class Board:
         # nothing more in this case, so that the board's watchdog can stop the motor.
         self.runaway_seen = False
 
-        self._commanded = ZERO
+        self._commanded = self.zero
         # Time for which `drive` has sent lines since the last reply. If this computer is late, only
         # one line period of its delay counts, because a delay does not show a silent board.
         self._unanswered_s = 0.0
@@ -150,7 +152,7 @@ class Board:
         self._sequence = 0
         self._lines = LineReader()
         self.restarts = Restarts()
-        self._codecs = {comma: Codec(WheelMap(), comma) for comma in (False, True)}
+        self._codecs = {comma: MotorCodec(self.letters, comma) for comma in (False, True)}
 
     def open(self, baud_rate: int) -> None:
         """Open the port at this baud rate, or change its rate. Discard all received lines."""
@@ -194,6 +196,11 @@ class Board:
             pass
 
     @property
+    def example(self) -> str:
+        """A reply in the documented form, for texts."""
+        return self._codecs[False].stop.decode().strip()
+
+    @property
     def now_s(self) -> float:
         """Present monotonic time, s."""
         return self.wire.now_ns() / NS_PER_S
@@ -211,7 +218,7 @@ class Board:
     @property
     def line_s(self) -> float:
         """Time for the transmission of the longest line, with a margin of 25 %, s."""
-        longest = line_bytes(4, True, self.sealed, self.sampled)
+        longest = line_bytes(len(self.letters), True, self.sealed, self.sampled)
         return 1.25 * wire_ns(longest, self.baud_rate) / NS_PER_S
 
     @property
@@ -221,9 +228,13 @@ class Board:
 
     # Sending
 
+    def only(self, motors: Sequence[int], speed: float = SPEED) -> Motors:
+        """Return the speeds that turn only `motors`, by their numbers, all at `speed` rad/s."""
+        return tuple(speed if n in motors else 0.0 for n in range(len(self.letters)))
+
     def line(self, motors: Motors, comma: bool | None = None) -> bytes:
         """Return the line for the speeds `motors`; `comma` None means the value of `self.comma`."""
-        line = self._codecs[self.comma if comma is None else comma].encode(WheelSpeeds(*motors))
+        line = self._codecs[self.comma if comma is None else comma].encode(motors)
         if not self.sealed:
             return line
         self._sequence = (self._sequence + 1) % SEQUENCES
@@ -244,13 +255,13 @@ class Board:
     def zeros(self) -> None:
         """Send zeros in two lines, with and without a comma, and with a checksum if `sealed`.
 
-        Some firmware stops motor d only at one of the endings. A line end comes first, so that a
-        partial line does not spoil the two.
+        Some firmware stops the last motor only at one of the endings. A line end comes first, so
+        that a partial line does not spoil the two.
         """
-        self._commanded = ZERO
+        self._commanded = self.zero
         plain = self._codecs[True].stop + self._codecs[False].stop
-        self.wire.send(b"\r\n" + plain + (self.line(ZERO) if self.sealed else b""))
-        self.restarts.record_speeds(ZERO, self.now_s)
+        self.wire.send(b"\r\n" + plain + (self.line(self.zero) if self.sealed else b""))
+        self.restarts.record_speeds(self.zero, self.now_s)
 
     def comes_back(self) -> bool:
         """Send zeros until the board answers; return whether it does so within `motion.BOOT_S`."""
@@ -264,7 +275,7 @@ class Board:
 
     def send_zero(self, wait_s: float = 0.0, comma: bool | None = None) -> None:
         """Send one line of zeros, then listen for `wait_s`, but at least for `period_s`."""
-        self.send(ZERO, comma)
+        self.send(self.zero, comma)
         self.listen(max(wait_s, self.period_s))
 
     def answers(
@@ -308,7 +319,7 @@ class Board:
         return WATCHDOG_S + 4 * self.gap_s
 
     def _silence(self, motors: Motors, seconds: float) -> StoppedError:
-        turned = [motor for motor in range(4) if motors[motor]]
+        turned = [motor for motor, speed in enumerate(motors) if speed]
         outcome = "link: silent" if turned else "link: silent at zeros"
         names = motor_names(self.mcu, turned)
         # A delay of this computer that is much shorter than the silence cannot cause it.
@@ -358,7 +369,7 @@ class Board:
                     continue
                 at_s = (at_ns - wire_ns(following, self.baud_rate)) / NS_PER_S
                 reply = self._reply(line, at_s)
-                self.traffic.line(line, reply is not None, 4)
+                self.traffic.line(line, reply is not None, self.letters)
                 self.good_run = self.good_run + 1 if reply is not None else 0
                 self.longest_run = max(self.longest_run, self.good_run)
                 if restart := self.restarts.check_line(line, at_s, reply):
@@ -387,9 +398,9 @@ class Board:
         try:
             plain, reading = line, None
             if self.sealed or b"#" in line:
-                checked = unseal(line, 4)
+                checked = unseal(line, len(self.letters))
                 plain, reading = checked.plain, checked.reading
-            return BoardReply(at_s, self._codecs[False].decode(plain).as_tuple(), line, reading)
+            return BoardReply(at_s, self._codecs[False].decode(plain), line, reading)
         except FrameError:
             self.unrecognized_lines.append(line)
             return None
@@ -412,7 +423,7 @@ class Board:
         finding = outcomes.find(
             "runaway: against" if commanded * speed < 0 else "runaway: along",
             motor=motor_name(self.mcu, motor),
-            letter=LETTERS[motor],
+            letter=self.letters[motor],
             told=commanded,
             seen=speed,
             most=motion.RUNAWAY_SPEED,
@@ -426,7 +437,7 @@ class Board:
     # Standing still
 
     def turning(self) -> list[int]:
-        last = self.replies[-1].motors if self.replies else ZERO
+        last = self.replies[-1].motors if self.replies else self.zero
         return motion.moving(last, motion.STANDING_SPEED)
 
     def stop_motors(self) -> None:
@@ -449,7 +460,7 @@ class Board:
         # A board may ignore lines with the other ending. So a silence counts only if the board
         # answered neither ending.
         if silent and (seconds := self._unheard_s(began_s)) > self._max_silence_s:
-            raise self._silence(ZERO, seconds)
+            raise self._silence(self.zero, seconds)
         self._abandon()
         turning = motion.turning(self.replies, self.now_s) or turning
         motors = motor_names(self.mcu, turning, ", ") or "a motor"
@@ -475,4 +486,5 @@ class Board:
             self.send_zero(comma=comma)
 
     def _slows(self) -> bool:
-        return min(motion.trend(self.replies, self.now_s, self.gap_s)) < motion.SLOWING_RATIO
+        shares = motion.trend(self.replies, self.zero, self.now_s, self.gap_s)
+        return min(shares) < motion.SLOWING_RATIO

@@ -7,39 +7,40 @@ from collections.abc import Sequence
 from acsard.checkup import outcomes
 from acsard.checkup.board import Board
 from acsard.checkup.findings import Finding
-from acsard.checkup.motion import SHORT_MEASUREMENT_S, SPEED, ZERO, moving
+from acsard.checkup.motion import SHORT_MEASUREMENT_S, moving
+from acsard.core.config.wire_time import TOKEN_BYTES
 from acsard.core.link.checked_line import seal
-from acsard.core.link.codec import LETTERS
 
 # They do not change the speeds, so it is not dangerous if the board obeys these lines.
 HARMLESS_KINDS = {"over-long", "garbage before it"}
 
 
-def broken_lines(comma: bool, sealed: bool, motors: Sequence[int]) -> list[tuple[str, bytes]]:
+def broken_lines(board: Board, motors: Sequence[int]) -> list[tuple[str, bytes]]:
     """Return damaged lines that would turn `motors`, each with the name of its damage."""
-    a, b, c, d = (
-        f"{letter}p{SPEED if motor in motors else 0.0:05.2f}"
-        for motor, letter in enumerate(LETTERS)
-    )
-    end = ",\r\n" if comma else "\r\n"
+    letters, speeds = board.letters, board.only(motors)
+    tokens = [f"{letter}p{v:05.2f}" for letter, v in zip(letters, speeds, strict=True)]
+    first, second, third = tokens[0], tokens[1], tokens[-2]  # of two values, the third is the first
+    wrong_letter = next(letter for letter in "xyzwv" if letter not in letters)
+    end = ",\r\n" if board.comma else "\r\n"
 
     def line(*tokens: str) -> bytes:
         return (",".join(tokens) + end).encode()
 
+    whole, size = line(*tokens), TOKEN_BYTES * len(tokens)
     lines = [
-        ("a value is missing", line(a, b, c)),
-        ("a wrong letter", line(a, b, c, "x" + d[1:])),
-        ("a letter twice", line(a, a, c, d)),
-        ("a bad digit", line(a, "bp0x.00", c, d)),
-        ("neither p nor n", line(a, b, "cq" + c[2:], d)),
-        ("cut short", line(a, b, c, d)[:20] + b"\r\n"),
-        ("cut inside the last number", line(a, b, c, d)[:30] + b"\r\n"),
-        ("cut inside the last number", line(a, b, c, d)[:27] + b"\r\n"),
-        ("over-long", line(*(a, b, c, d) * 5)),
-        ("garbage before it", b"\xff~" + line(a, b, c, d)),
+        ("a value is missing", line(*tokens[:-1])),
+        ("a wrong letter", line(*tokens[:-1], wrong_letter + tokens[-1][1:])),
+        ("a letter twice", line(first, first, *tokens[2:])),
+        ("a bad digit", line(first, second[:2] + "0x.00", *tokens[2:])),
+        ("neither p nor n", line(*tokens[:-2], third[0] + "q" + third[2:], tokens[-1])),
+        ("cut short", whole[: size - 12] + b"\r\n"),
+        ("cut inside the last number", whole[: size - 2] + b"\r\n"),
+        ("cut inside the last number", whole[: size - 5] + b"\r\n"),
+        ("over-long", line(*tokens * (20 // len(tokens)))),
+        ("garbage before it", b"\xff~" + whole),
     ]
-    if sealed:
-        good = seal(line(a, b, c, d), 7)
+    if board.sealed:
+        good = seal(whole, 7)
         wrong = good[:-3] + (b"0" if good[-3:-2] != b"0" else b"1") + b"\r\n"
         lines += [("a wrong check", wrong), ("a check cut short", good[:-4] + b"\r\n")]
     return lines
@@ -52,9 +53,9 @@ def finding(board: Board, motors: Sequence[int]) -> Finding:
     """
     if not motors:
         return outcomes.find("damaged lines: untested")
-    lines = broken_lines(board.comma, board.sealed, motors)
+    lines = broken_lines(board, motors)
     # A coarse encoder may report an earlier movement only now.
-    board.drive(ZERO, SHORT_MEASUREMENT_S)
+    board.drive(board.zero, SHORT_MEASUREMENT_S)
     took = dict.fromkeys(what for what, line in lines if _moves(board, line))
     if not took:
         return outcomes.find("damaged lines: right", lines=len(lines))
@@ -70,6 +71,6 @@ def _moves(board: Board, line: bytes) -> bool:
     for _ in range(3):
         board.wire.send(line)
         board.listen(max(SHORT_MEASUREMENT_S / 6, len(line) * 12 / board.baud_rate))
-    replies = board.drive(ZERO, SHORT_MEASUREMENT_S + 2 * board.gap_s)
+    replies = board.drive(board.zero, SHORT_MEASUREMENT_S + 2 * board.gap_s)
     board.stop_motors()
     return any(moving(reply.motors) for reply in replies)

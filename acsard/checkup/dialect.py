@@ -13,7 +13,7 @@ from typing import get_args
 from acsard.checkup import lateness, motion, outcomes
 from acsard.checkup.board import Board
 from acsard.checkup.findings import Finding, StoppedError, motor_name
-from acsard.checkup.motion import BOOT_S, SHORT_MEASUREMENT_S, WATCHDOG_SILENCE_S, ZERO, BoardReply
+from acsard.checkup.motion import BOOT_S, SHORT_MEASUREMENT_S, WATCHDOG_SILENCE_S, BoardReply
 from acsard.core.config.settings import MAX_REPLY_PERIOD_S, Baud
 from acsard.core.config.wire_time import COMFORTABLE_USE, highest_rate, line_bytes
 from acsard.core.formatting import printable_bytes
@@ -47,8 +47,15 @@ def baud(board: Board) -> Finding:
                 heard=data.counted,
             )
     board.open(configured)
-    finding = outcomes.find(f"baud rate: {data.code}", heard=data.counted, configured=configured)
-    raise StoppedError(finding)
+    raise StoppedError(
+        outcomes.find(
+            f"baud rate: {data.code}",
+            heard=data.counted,
+            configured=configured,
+            example=board.example,
+            wheels=data.wheels,
+        )
+    )
 
 
 def _knock(board: Board, seconds: float) -> bool:
@@ -56,7 +63,7 @@ def _knock(board: Board, seconds: float) -> bool:
     while board.now_s < end_s:
         board.zeros()
         # Firmware with the checked link refuses plain lines once it has accepted a checked line.
-        board.wire.send(seal(board.line(ZERO), 0))
+        board.wire.send(seal(board.line(board.zero), 0))
         board.listen(max(SHORT_MEASUREMENT_S / 4, 5 * board.period_s))
         if len(board.replies) >= 3:
             board.sealed = all(b"#" in reply.line for reply in board.replies)
@@ -107,15 +114,15 @@ def _answers(board: Board, comma: bool) -> list[BoardReply]:
 
 
 def comma(board: Board, dead: bool) -> Finding:
-    """Return the finding about `mcu.trailing_comma`, after the test of motor d.
+    """Return the finding about `mcu.trailing_comma`, after the test of the last motor.
 
-    Some firmware turns or stops motor d only if the line ends with a comma. `dead` says that its
-    movement was not seen.
+    Some firmware turns or stops the last motor only if the line ends with a comma. `dead` says that
+    its movement was not seen.
     """
     if board.comma != board.mcu.trailing_comma:
         return _comma_wrong(board, "latched" if board.latched and board.comma else "disobeyed")
     if dead:
-        return outcomes.find("trailing comma: dead")
+        return outcomes.find("trailing comma: dead", last=board.letters[-1])
     how = "sent" if board.comma else "not sent"
     return outcomes.find(f"trailing comma: {how}", {"mcu.trailing_comma": board.comma})
 
@@ -127,7 +134,7 @@ def _comma_wrong(board: Board, how: str) -> Finding:
         figure="needed" if board.comma else "refused",
         form="with" if board.comma else "without",
         comma="true" if board.comma else "false",
-        last=motor_name(board.mcu, 3),
+        last=motor_name(board.mcu, len(board.letters) - 1),
     )
 
 
@@ -151,7 +158,10 @@ def replies(board: Board) -> Finding:
         names.append("other decimals")
     if not names:
         return outcomes.find("reply form: right")
-    return outcomes.find("reply form: other", forms=", ".join(names), line=lines[-1].decode())
+    line = lines[-1].decode()
+    return outcomes.find(
+        "reply form: other", forms=", ".join(names), line=line, example=board.example
+    )
 
 
 def check(board: Board) -> Finding:
@@ -180,11 +190,13 @@ def rate(board: Board) -> Finding:
     unasked = board.listen(WATCHDOG_SILENCE_S)
     # Late replies to earlier lines arrive almost at the same time, unlike reports.
     board.own_clock = bool(unasked) and unasked[-1].at_s - unasked[0].at_s > SHORT_MEASUREMENT_S
-    highest_hz = highest_rate(board.baud_rate, line_bytes(4, board.comma), COMFORTABLE_USE)
+    highest_hz = highest_rate(
+        board.baud_rate, line_bytes(len(board.letters), board.comma), COMFORTABLE_USE
+    )
     period_s, before = 1 / min(board.rate_hz, highest_hz), board.sent_lines
-    answers = board.drive(ZERO, 0.5, period_s)
+    answers = board.drive(board.zero, 0.5, period_s)
     if len(answers) < 10:
-        answers += board.drive(ZERO, 1.0, period_s)
+        answers += board.drive(board.zero, 1.0, period_s)
     if len(answers) < 2:
         return outcomes.find("reply rate: none")
     gaps = motion.gaps(answers)

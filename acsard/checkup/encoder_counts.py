@@ -10,7 +10,6 @@ from acsard.checkup import line_loss, outcomes
 from acsard.checkup.board import Board
 from acsard.checkup.findings import Finding, motor_names
 from acsard.checkup.motion import SHORT_MEASUREMENT_S, BoardReply, steps
-from acsard.core.link.codec import LETTERS
 
 # Largest tolerated relative difference between the measured and the expected counts per turn.
 MAX_COUNT_DIFFERENCE = 0.02
@@ -96,7 +95,9 @@ def finding(board: Board, motors: Sequence[int]) -> Finding:
         names, least = motor_names(board.mcu, wrong), min(each.values())
         return outcomes.find("encoder counts: backward", unused, names=names, measured=least)
     if each and min(each.values()) < MIN_COUNT_RATIO * max(each.values()):
-        listing = ", ".join(f"{LETTERS[motor]} {counts:.0f}" for motor, counts in each.items())
+        listing = ", ".join(
+            f"{board.letters[motor]} {counts:.0f}" for motor, counts in each.items()
+        )
         return outcomes.find("encoder counts: unequal", unused, shown=listing)
     if measured is None:
         counts, how = named, "the firmware states this number; the check could not measure it"

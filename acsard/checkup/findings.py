@@ -8,8 +8,7 @@ from typing import Literal
 from msgspec import Struct
 
 from acsard.core.config.settings import McuConfig
-from acsard.core.link.codec import LETTERS
-from acsard.core.values import WHEELS, AcsardError
+from acsard.core.values import AcsardError
 
 Verdict = Literal["PASS", "WARN", "FAIL", "SKIPPED"]
 
@@ -46,11 +45,10 @@ class WireLostError(AcsardError):
 
 def wheel_of(mcu: McuConfig, motor: int) -> tuple[str, int]:
     """Return the configured wheel of a motor, and -1 if positive speeds turn it backward."""
-    for wheel in WHEELS:
-        entry = getattr(mcu.wheels, wheel)
-        if entry[1] == LETTERS[motor]:
-            return wheel, -1 if entry[0] == "-" else 1
-    raise ValueError(f"the configuration has no wheel with motor {LETTERS[motor]}")
+    wheels = mcu.wheels
+    sign_of = {entry[1]: -1 if entry[0] == "-" else 1 for entry in wheels.motors}
+    letter = wheels.letters[motor]
+    return wheels.names[[*sign_of].index(letter)], sign_of[letter]
 
 
 def with_spaces(wheel: str) -> str:
@@ -59,8 +57,8 @@ def with_spaces(wheel: str) -> str:
 
 
 def motor_name(mcu: McuConfig, motor: int) -> str:
-    """Return a text such as "motor d (rear right)" for motor 3 and its configured wheel."""
-    return f"motor {LETTERS[motor]} ({with_spaces(wheel_of(mcu, motor)[0])})"
+    """Return a text such as "motor d (rear right)" for a motor and its configured wheel."""
+    return f"motor {mcu.wheels.letters[motor]} ({with_spaces(wheel_of(mcu, motor)[0])})"
 
 
 def motor_names(mcu: McuConfig, motors: Sequence[int], joint: str = " and ") -> str:

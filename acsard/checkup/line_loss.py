@@ -14,7 +14,7 @@ from msgspec import Struct
 from acsard.checkup import lateness, motion, outcomes
 from acsard.checkup.board import Board
 from acsard.checkup.findings import Finding, StoppedError
-from acsard.checkup.motion import ZERO, BoardReply
+from acsard.checkup.motion import BoardReply
 from acsard.core.config.wire_time import COMFORTABLE_USE, highest_rate, line_bytes
 from acsard.core.formatting import printable_bytes
 from acsard.core.link.link_diagnosis import MAX_SHOWN_BYTES, is_text
@@ -58,7 +58,7 @@ def finding(board: Board) -> Finding:
     # Wait until the replies to earlier lines have arrived.
     board.listen(motion.SHORT_MEASUREMENT_S)
     began_s, sent, others = board.now_s, board.sent_lines, len(board.unrecognized_lines)
-    board.drive(ZERO, MIN_COUNT_S, _period_s(board))
+    board.drive(board.zero, MIN_COUNT_S, _period_s(board))
     silent_s = _silence_s(board, motion.since(board.replies, began_s))
     while True:
         board.listen(motion.SHORT_MEASUREMENT_S)
@@ -66,7 +66,7 @@ def finding(board: Board) -> Finding:
         enough = count.lines >= MAX_COUNTED_LINES or board.now_s - began_s > MAX_COUNT_S
         if enough or not count.lost:
             break
-        board.drive(ZERO, 0.5, _period_s(board))
+        board.drive(board.zero, 0.5, _period_s(board))
     board.lost = count.share
     if board.lost <= MAX_LOSS:
         outcome = "late" if silent_s else "few" if count.lost else "none"
@@ -90,7 +90,7 @@ def finding(board: Board) -> Finding:
 
 
 def _period_s(board: Board) -> float:
-    longest = line_bytes(4, board.comma, board.sealed, board.sampled)
+    longest = line_bytes(len(board.letters), board.comma, board.sealed, board.sampled)
     period_s = 1 / min(board.rate_hz, highest_rate(board.baud_rate, longest, COMFORTABLE_USE))
     if not board.own_clock and board.gap_s > 1.5 * period_s:
         return 1.25 * board.gap_s

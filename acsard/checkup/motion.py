@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from bisect import bisect_left, bisect_right
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from itertools import pairwise
 from statistics import fmean
 
@@ -49,8 +49,6 @@ STANDSTILL_TIMEOUT_S = MAX_WATCHDOG_S + MOTOR_TIMEOUT_S
 # `turning` ignores replies that are older than this, s.
 MAX_REPLY_AGE_S = 1.0
 
-ZERO: Motors = (0.0, 0.0, 0.0, 0.0)
-
 TREND_S = 0.5  # shortest duration of each of the two intervals whose mean speeds `trend` compares
 
 # Below this ratio of `trend`, a motor slows down; above its inverse, it speeds up.
@@ -58,7 +56,7 @@ SLOWING_RATIO = 0.97
 
 
 class BoardReply(Struct, frozen=True):
-    """A valid reply: time of arrival, speeds of the motors a to d in rad/s, and its text.
+    """A valid reply: time of arrival, speeds of the motors in rad/s, and its text.
 
     `reading` has the board's clock and encoder counts, if the reply has them.
     """
@@ -82,20 +80,9 @@ class ReplyInterval(Struct, frozen=True):
     counts: Motors | None = None
 
 
-def each(value: Callable[[int], float]) -> Motors:
-    """Return a tuple of four numbers: `value(motor)` for each motor number from 0 to 3."""
-    a, b, c, d = (value(motor) for motor in range(4))
-    return a, b, c, d
-
-
-def only(motors: Sequence[int], speed: float = SPEED) -> Motors:
-    """Return the speeds that turn only `motors` (numbers 0 to 3), all at `speed` rad/s."""
-    return each(lambda motor: speed if motor in motors else 0.0)
-
-
 def moving(speeds: Motors, least: float = MOVING_SPEED) -> list[int]:
     """Return the numbers of the motors that turn at `least` rad/s or faster, in any direction."""
-    return [motor for motor in range(4) if abs(speeds[motor]) >= least]
+    return [motor for motor, speed in enumerate(speeds) if abs(speed) >= least]
 
 
 def since(
@@ -111,9 +98,9 @@ def gaps(replies: Sequence[BoardReply]) -> list[float]:
     return [after.at_s - before.at_s for before, after in pairwise(replies)]
 
 
-def mean(replies: Sequence[BoardReply]) -> Motors:
-    """Return the mean speed of each encoder in these replies, rad/s, or zeros without replies."""
-    return each(lambda motor: fmean([reply.motors[motor] for reply in replies] or [0.0]))
+def mean(replies: Sequence[BoardReply], zero: Motors) -> Motors:
+    """Return the mean speed of each encoder in these replies, rad/s, or `zero` without replies."""
+    return tuple(map(fmean, zip(*(reply.motors for reply in replies), strict=True))) or zero
 
 
 def steps(replies: Sequence[BoardReply]) -> Iterator[ReplyInterval]:
@@ -126,10 +113,12 @@ def steps(replies: Sequence[BoardReply]) -> Iterator[ReplyInterval]:
         pairs = zip(previous.counts, other.counts, strict=True)
         deltas = [(b - a + FIELD_VALUES // 2) % FIELD_VALUES - FIELD_VALUES // 2 for a, b in pairs]
         mcu_s = (other.mcu_ms - previous.mcu_ms) % FIELD_VALUES / 1000
-        yield ReplyInterval(seconds, after.motors, mcu_s, each(deltas.__getitem__))
+        yield ReplyInterval(seconds, after.motors, mcu_s, tuple(deltas))
 
 
-def covered(replies: Sequence[BoardReply], since_s: float, per_turn: float = 0.0) -> Motors:
+def covered(
+    replies: Sequence[BoardReply], zero: Motors, since_s: float, per_turn: float = 0.0
+) -> Motors:
     """Return the angle by which each encoder has turned since the time `since_s`, rad.
 
     It is that of the counts where replies have them and `per_turn` is known, else that of the
@@ -141,8 +130,8 @@ def covered(replies: Sequence[BoardReply], since_s: float, per_turn: float = 0.0
             return step.counts[motor] / per_turn * math.tau
         return step.speeds[motor] * step.seconds
 
-    course = list(steps([BoardReply(since_s, ZERO, b""), *since(replies, since_s)]))
-    return each(lambda motor: sum(angle(step, motor) for step in course))
+    course = list(steps([BoardReply(since_s, zero, b""), *since(replies, since_s)]))
+    return tuple(sum(angle(step, motor) for step in course) for motor in range(len(zero)))
 
 
 def turning(replies: Sequence[BoardReply], now_s: float) -> list[int]:
@@ -154,7 +143,7 @@ def turning(replies: Sequence[BoardReply], now_s: float) -> list[int]:
     # The motor counts as turning for the time that it would need to turn by the reported angle at
     # the speed `STANDING_SPEED`.
     motors: set[int] = set()
-    for reply, earlier in pairwise(reversed([BoardReply(-math.inf, ZERO, b""), *replies])):
+    for reply, earlier in pairwise(reversed([BoardReply(-math.inf, (), b""), *replies])):
         ago_s = now_s - reply.at_s
         if ago_s > MAX_REPLY_AGE_S:
             break
@@ -167,16 +156,16 @@ def turning(replies: Sequence[BoardReply], now_s: float) -> list[int]:
     return sorted(motors)
 
 
-def trend(replies: Sequence[BoardReply], now_s: float, gap_s: float) -> Motors:
+def trend(replies: Sequence[BoardReply], zero: Motors, now_s: float, gap_s: float) -> Motors:
     """Return for each motor its present mean speed divided by that shortly before.
 
     It is 1 for a motor that stands still. The means are over two successive intervals.
     """
     span_s = max(TREND_S, 4 * gap_s)
-    before = mean(since(replies, now_s - 2 * span_s, now_s - span_s))
-    now = mean(since(replies, now_s - span_s, now_s))
-    turn = [min(abs(speed), abs(other)) > 0.1 for speed, other in zip(before, now, strict=True)]
-    return each(lambda motor: abs(now[motor] / before[motor]) if turn[motor] else 1.0)
+    before = mean(since(replies, now_s - 2 * span_s, now_s - span_s), zero)
+    now = mean(since(replies, now_s - span_s, now_s), zero)
+    pairs = zip(before, now, strict=True)
+    return tuple(abs(b / a) if min(abs(a), abs(b)) > 0.1 else 1.0 for a, b in pairs)
 
 
 def grain_s(steady: Sequence[BoardReply], motors: Sequence[int]) -> float:
@@ -204,7 +193,7 @@ def runaway(replies: Sequence[BoardReply]) -> tuple[int, float] | None:
     for span_s in (SHORT_MEASUREMENT_S / 2, SHORT_MEASUREMENT_S) if replies else ():
         near = since(replies, replies[-1].at_s - span_s)
         course = list(steps(max(near, replies[-4:], key=len)))
-        for motor in range(4):
+        for motor in range(len(replies[-1].motors)):
             pieces = [
                 (min(SHORT_MEASUREMENT_S, step.seconds), step.speeds[motor]) for step in course
             ]

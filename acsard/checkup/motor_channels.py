@@ -15,10 +15,15 @@ from msgspec import Struct, structs
 from acsard.checkup import motion, outcomes
 from acsard.checkup.board import Board, Operator
 from acsard.checkup.findings import Finding, motor_name, wheel_of, with_spaces
-from acsard.checkup.motion import PROBE_MOVING_SPEED, SHORT_MEASUREMENT_S, SPEED, ZERO, moving
+from acsard.checkup.motion import (
+    MOVING_SPEED,
+    PROBE_MOVING_SPEED,
+    SHORT_MEASUREMENT_S,
+    SPEED,
+    moving,
+)
 from acsard.core.config.settings import McuConfig
-from acsard.core.link.codec import LETTERS, Motors
-from acsard.core.values import WHEELS
+from acsard.core.link.codec import Motors
 
 # Largest relative difference between an encoder's speed and the commanded speed. If the difference
 # is larger, the check fails.
@@ -45,9 +50,9 @@ FOLLOWING_KINDS: tuple[Kind, ...] = ("right", "off", "size")
 
 
 class Channel(Struct, frozen=True):
-    """Behavior of one motor in its test, as the four encoders and the operator report it.
+    """Behavior of one motor in its test, as the encoders and the operator report it.
 
-    `forth` has the speeds of the four encoders, rad/s, for the command forward (letter p), and
+    `forth` has the speeds of all encoders, rad/s, for the command forward (letter p), and
     `back` those for backward (letter n).
     """
 
@@ -67,7 +72,7 @@ class Channel(Struct, frozen=True):
 
     @property
     def moved(self) -> list[int]:
-        """Numbers (0 to 3) of the encoders that moved while this motor was commanded to turn."""
+        """Numbers of the encoders that moved while this motor was commanded to turn."""
         if not self.probed:
             return moving(self.forth) or moving(self.back)
         return moving(self.forth, max(PROBE_MOVING_SPEED, max(map(abs, self.forth)) / 4))
@@ -95,6 +100,12 @@ class Channel(Struct, frozen=True):
         return "off" if self.error > WARN_TOLERANCE + self.unsure else "right"
 
     @property
+    def follows(self) -> bool:
+        """Whether the own encoder moved as commanded in both directions, alone or not."""
+        own = self.motor
+        return self.judged and self.forth[own] >= MOVING_SPEED and self.back[own] <= -MOVING_SPEED
+
+    @property
     def error(self) -> float:
         """Larger relative difference of the own encoder's speed from the command, of both
         directions.
@@ -107,6 +118,7 @@ def encoder_finding(mcu: McuConfig, channel: Channel) -> Finding:
     motor, moved = channel.motor, channel.moved
     forth, back = channel.forth[motor], channel.back[motor]
     there = moved[0] if moved else motor
+    letters = mcu.wheels.letters
     # If a motor seems to stand still for half of `beyond_s` in a measurement of
     # `SHORT_MEASUREMENT_S`, then it seems too slow by the part of the error that exceeds
     # `FAIL_TOLERANCE`. `lateness.is_doubtful` compares a delay of this computer with half of this
@@ -121,9 +133,9 @@ def encoder_finding(mcu: McuConfig, channel: Channel) -> Finding:
         "motor: loose" if loose else f"motor: {channel.kind}{_fault_suffix(mcu, channel)}",
         name=motor_name(mcu, motor),
         figure=f"{forth:+.2f} {'rad/s, probed' if channel.probed else f'{back:+.2f} rad/s'}",
-        shown=", ".join(f"encoder {LETTERS[m]} {channel.forth[m]:+.2f}" for m in moved),
-        here=LETTERS[motor],
-        there=LETTERS[there],
+        shown=", ".join(f"encoder {letters[m]} {channel.forth[m]:+.2f}" for m in moved),
+        here=letters[motor],
+        there=letters[there],
         reversed=", and one motor or encoder is reversed" if channel.forth[there] < 0 else "",
         wheel=with_spaces(wheel_of(mcu, motor)[0]),
         error=channel.error,
@@ -171,12 +183,13 @@ def wheel_map(mcu: McuConfig, channels: Sequence[Channel]) -> Finding:
             wheel, sign = channel.wheel, 1 if channel.forward else -1
         if wheel in entries:
             return outcomes.find("wheel map: twice", wheel=with_spaces(wheel))
-        entries[wheel] = f"{'+' if sign > 0 else '-'}{LETTERS[channel.motor]}"
-    wrong = [wheel for wheel in WHEELS if entries[wheel] != getattr(mcu.wheels, wheel)]
+        entries[wheel] = f"{'+' if sign > 0 else '-'}{mcu.wheels.letters[channel.motor]}"
+    names = WHEEL_ANSWERS[len(channels)].values()
+    wrong = [wheel for wheel in names if entries[wheel] != getattr(mcu.wheels, wheel)]
     return outcomes.find(
         "wheel map: other" if wrong else "wheel map: right",
-        {f"mcu.wheels.{wheel}": entries[wheel] for wheel in WHEELS},
-        map=" ".join(entries[wheel] for wheel in WHEELS),
+        {f"mcu.wheels.{wheel}": entries[wheel] for wheel in names},
+        map=" ".join(entries[wheel] for wheel in names),
         wheels=", ".join(map(with_spaces, wrong)),
     )
 
@@ -191,9 +204,11 @@ LONG_MEASUREMENT_S = 0.75 * motion.MOTOR_TIMEOUT_S
 # Largest number of short measurements that `run_up` averages to get the present speed.
 MAX_MEASUREMENTS = 8
 
+# By the number of wheels, in the order of `acsard.toml`.
 WHEEL_ANSWERS = {
-    "fr": "front_right", "fl": "front_left", "rl": "rear_left", "rr": "rear_right", "none": "",
-}  # fmt: skip
+    4: {"fr": "front_right", "fl": "front_left", "rl": "rear_left", "rr": "rear_right"},
+    2: {"l": "left", "r": "right"},
+}
 
 
 def turn(board: Board, motor: int, speed: float) -> tuple[Motors, float]:
@@ -201,13 +216,14 @@ def turn(board: Board, motor: int, speed: float) -> tuple[Motors, float]:
 
     The second result is the possible relative error, because an encoder counts whole steps.
     """
-    means = run_up(board, motion.only([motor], speed))
+    means = run_up(board, board.only([motor], speed))
     unsure = _unsure(board, motor, 2 * _look_s(board))
     if REPEAT_FRACTION * WARN_TOLERANCE + unsure < abs(means[motor] / speed - 1) <= FAIL_TOLERANCE:
         # The motor is weak, or its wheel is heavy and has not yet reached its speed. A longer
         # measurement shows which of the two is the case.
-        board.drive(motion.only([motor], speed), motion.MOTOR_TIMEOUT_S)
-        means = motion.mean(motion.since(board.replies, board.now_s - LONG_MEASUREMENT_S))
+        board.drive(board.only([motor], speed), motion.MOTOR_TIMEOUT_S)
+        steady = motion.since(board.replies, board.now_s - LONG_MEASUREMENT_S)
+        means = motion.mean(steady, board.zero)
         unsure = _unsure(board, motor, LONG_MEASUREMENT_S)
     return means, unsure
 
@@ -228,23 +244,22 @@ def run_up(board: Board, motors: Motors) -> Motors:
     It returns when the speeds are steady, when time is over, or earlier if no encoder moves.
     """
     steps = max(1, int(motion.SHORT_MEASUREMENT_S / board.period_s))
-    before = ZERO
+    before = board.zero
     for step in range(1, steps + 1):
-        a, b, c, d = (round(speed * step / steps, 2) for speed in motors)
-        command = a, b, c, d
+        command = tuple(round(speed * step / steps, 2) for speed in motors)
         replies = [reply.motors for reply in board.drive(command, board.period_s)]
         board.repeats.record(replies, before, command)
         before = command
     board.repeats.check()
     began_s, look_s = board.now_s, _look_s(board)
-    driven = [motor for motor in range(4) if motors[motor]]
-    means, looks, steady = ZERO, 0, 0
+    driven = [motor for motor, speed in enumerate(motors) if speed]
+    means, looks, steady = board.zero, 0, 0
     while steady < 2 and board.now_s - began_s < _patience_s(board, driven):
         board.drive(motors, look_s)
         looks += 1
         # A coarse encoder needs more measurements than a fine one.
         last = min(MAX_MEASUREMENTS, max(1, looks - 1))
-        means = motion.mean(motion.since(board.replies, board.now_s - last * look_s))
+        means = motion.mean(motion.since(board.replies, board.now_s - last * look_s), board.zero)
         near = [
             m for m in moving(means) if abs(abs(means[m]) / motion.SPEED - 1) < 0.4 * FAIL_TOLERANCE
         ]
@@ -256,7 +271,7 @@ def run_up(board: Board, motors: Motors) -> Motors:
 
 
 def _patience_s(board: Board, driven: list[int]) -> float:
-    shares = motion.trend(board.replies, board.now_s, board.gap_s)
+    shares = motion.trend(board.replies, board.zero, board.now_s, board.gap_s)
     rises = any(shares[motor] > 1 / motion.SLOWING_RATIO for motor in driven)
     return motion.SLOWING_TIMEOUT_S if rises else motion.MOTOR_TIMEOUT_S
 
@@ -264,10 +279,11 @@ def _patience_s(board: Board, driven: list[int]) -> float:
 def channel(board: Board, motor: int) -> Channel:
     """Turn a motor forward and backward, and return how the encoders moved.
 
-    If motor d does not move, try the other line ending, and keep it if motor d moves then.
+    If the last motor does not move, try the other line ending, and keep it if it moves then.
     """
     result = _both_ways(board, motor)
-    if motor == 3 and result.kind == "dead" and not board.latched:
+    is_last = motor == len(board.letters) - 1
+    if is_last and result.kind == "dead" and not board.latched:
         result = _with_other_comma(board, result)
     return result
 
@@ -275,8 +291,8 @@ def channel(board: Board, motor: int) -> Channel:
 def _both_ways(board: Board, motor: int) -> Channel:
     speeds = probe(board, motor)
     if speeds is not None:
-        return Channel(motor, speeds, ZERO, probed=True)
-    (forth, unsure), back = turn(board, motor, motion.SPEED), ZERO
+        return Channel(motor, speeds, board.zero, probed=True)
+    (forth, unsure), back = turn(board, motor, motion.SPEED), board.zero
     if motor in moving(forth):
         board.stop_motors()
         back, other = turn(board, motor, -motion.SPEED)
@@ -291,7 +307,7 @@ def probe(board: Board, motor: int) -> Motors | None:
     """Turn a motor slowly and briefly, to find out whether its own encoder moves with it.
 
     If it moves, return None; the motor may still turn then. Else stop it, and return the speeds of
-    the four encoders.
+    all encoders.
     """
     # The firmware may drive a motor without a working encoder to full speed, but the probe is too
     # short for that. If the encoder does not follow, repeat the probe, because a coarse encoder may
@@ -312,20 +328,21 @@ def probe(board: Board, motor: int) -> Motors | None:
 
 
 def _probe(board: Board, motor: int, speed: float) -> Motors | None:
-    coasting = board.replies[-1].motors if board.replies else ZERO
+    coasting = board.replies[-1].motors if board.replies else board.zero
     began_s = board.now_s
 
     def mean_speeds() -> Motors:
         seconds = board.now_s - began_s
-        ran = motion.covered(board.replies, began_s)
-        sure = [max(0.0, abs(ran[m]) - abs(coasting[m]) * seconds) for m in range(4)]
-        return motion.each(lambda m: math.copysign(sure[m], ran[m]) / motion.SHORT_MEASUREMENT_S)
+        ran = motion.covered(board.replies, board.zero, began_s)
+        pairs = zip(ran, coasting, strict=True)
+        sure = [math.copysign(max(0.0, abs(a) - abs(v) * seconds), a) for a, v in pairs]
+        return tuple(angle / motion.SHORT_MEASUREMENT_S for angle in sure)
 
     own = 0.0
     while (
         board.now_s < began_s + motion.SHORT_MEASUREMENT_S and own > -4 * motion.PROBE_MOVING_SPEED
     ):
-        board.drive(motion.only([motor], speed), board.period_s)
+        board.drive(board.only([motor], speed), board.period_s)
         own = mean_speeds()[motor]
     if own >= motion.PROBE_MOVING_SPEED:
         return None
@@ -356,16 +373,17 @@ def ask_which_wheel(board: Board, operator: Operator, channel: Channel) -> Chann
 
     The wheels stand still during a question, and turn again on request.
     """
+    wheels = WHEEL_ANSWERS[len(board.letters)]
+    *others, last = (f"{with_spaces(wheel)} ({short})" for short, wheel in wheels.items())
     question = (
-        f"which wheel did motor {LETTERS[channel.motor]} turn: front right (fr), front left (fl), "
-        'rear left (rl) or rear right (rr)? Type "none" if no wheel turned, or "again" to see '
-        "the motor turn once more"
+        f"which wheel did motor {board.letters[channel.motor]} turn: {', '.join(others)} or "
+        f'{last}? Type "none" if no wheel turned, or "again" to see the motor turn once more'
     )
-    while (which := operator.ask(question, (*WHEEL_ANSWERS, "again"))) == "again":
+    while (which := operator.ask(question, (*wheels, "none", "again"))) == "again":
         _both_ways(board, channel.motor)
     if which is None:
         return channel
-    if wheel := WHEEL_ANSWERS[which]:
+    if wheel := wheels.get(which):
         question = (
             "which way did the wheel turn first: forward (as when the robot drives ahead) or back?"
         )

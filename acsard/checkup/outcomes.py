@@ -21,23 +21,23 @@ FAIL baud rate: other | {rate}, not {configured} baud
     -> write mcu.baud_rate = {rate}; the check goes on with it
 FAIL baud rate: received_nothing | nothing received
     {heard} at {configured} baud, and no good line at any other rate
-    -> is this the right port (`acsard ports`), does the board have power, does its firmware answer,
-    are TX and RX swapped?
+    -> is this the right port (`acsard ports`), does the board have power, does its firmware answer
+    `{example}` (the letters are those of mcu.wheels), are TX and RX swapped?
 FAIL baud rate: received_text | text instead of replies
     at {configured} baud {heard}; no good line at any other rate
     -> the baud rate is right, but the firmware prints other text: remove its Serial.print, and let
     it answer each line
 FAIL baud rate: received_form | replies in another form
     at {configured} baud {heard}; no good line at any other rate
-    -> the lines are whole, but the firmware must send `ap00.00,bp00.00,cp00.00,dp00.00`: p or n as
-    the sign, and two digits, a point and two digits in each figure, without spaces
+    -> the lines are whole, but the firmware must send `{example}`: p or n as the sign, and two
+    digits, a point and two digits in each figure, without spaces
 FAIL baud rate: received_letters | other motors
     at {configured} baud {heard}; no good line at any other rate
-    -> the lines are whole, but do not name each motor of mcu.wheels once: write the letters of the
-    board's lines into [mcu.wheels], of four wheels, or of `left` and `right` if two are driven
+    -> the lines are whole, but do not name each motor of mcu.wheels once: {wheels}; the check then
+    finds out which motor turns which wheel
 FAIL baud rate: received_cut | pieces of lines
     at {configured} baud {heard}; no good line at any other rate
-    -> the firmware cuts its replies short or omits the line end: it must send all four values and
+    -> the firmware cuts its replies short or omits the line end: it must send all values and
     Serial.println() in one reply; is its send buffer too small, or does it restart while it writes?
 FAIL baud rate: received_foreign | other bytes in the lines
     at {configured} baud {heard}; no good line at any other rate
@@ -71,7 +71,7 @@ FAIL identification: echo | an echo
 PASS reply form: right | as documented
 WARN reply form: other | {forms}
     replies look like {line!r}; the daemon reads them
-    -> nothing to do; `ap00.00,bp00.00,cp00.00,dp00.00` is shorter on the wire, and unambiguous
+    -> nothing to do; `{example}` is shorter on the wire, and unambiguous
 WARN reply form: text | also text
     the firmware also prints text, such as `{text}`: {texts} of {lines} lines
     -> remove its Serial.print, because such lines delay the replies
@@ -213,8 +213,8 @@ FAIL? motor: size | {figure}
 PASS trailing comma: sent | sent, as configured
 PASS trailing comma: not sent | not needed
 SKIPPED trailing comma: dead
-    motor d showed no movement with or without the comma, so the check cannot decide
-    -> fix motor d, and check again
+    motor {last} showed no movement with or without the comma, so the check cannot decide
+    -> fix motor {last}, and check again
 FAIL? trailing comma: refused | {figure}
     the board answers only lines {form} a comma at their end
     -> write mcu.trailing_comma = {comma}; the check goes on with it

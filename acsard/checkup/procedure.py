@@ -133,7 +133,7 @@ def run(
         why = "the check ended early: the serial line was lost"
     if all_restarts:
         once(restarts.finding(config.mcu, all_restarts))
-    motors = [motor_name(config.mcu, motor) for motor in range(4)]
+    motors = [motor_name(config.mcu, n) for n in range(len(config.mcu.wheels.letters))]
     names = ["motors"] if finding_names.isdisjoint(motors) else motors
     steps = [name for step in STEPS for name in (names if step == "motors" else [step])]
     rest = [step for step in steps if step not in finding_names]
@@ -197,10 +197,12 @@ class _Steps:
         self._take("", lambda: wheel_map(board.mcu, channels))
         right = [channel.motor for channel in channels if channel.kind in ("right", "off")]
         self._take("", lambda: encoder_counts.finding(board, right))
+        # If no motor is right, motors that are coupled or too slow show the watchdog too.
+        turned = right or [channel.motor for channel in channels if channel.follows]
         together = "the motors turn, then this computer sends nothing, perhaps several times"
-        self._measure(together, lambda: watchdog.finding(board, right))
+        self._measure(together, lambda: watchdog.finding(board, turned))
         broken = "sending damaged lines; a motor that turns now is a fault"
-        self._measure(broken, lambda: damage.finding(board, right))
+        self._measure(broken, lambda: damage.finding(board, turned))
         self._take("", lambda: inputs.finding(board, operator, safety))
 
     def _stop_and_arm(self) -> None:
@@ -209,10 +211,10 @@ class _Steps:
 
     def _turn_motors(self) -> None:
         # Wait with the findings of motors that do not turn until one turns: if none does, one cause
-        # is more likely than four.
+        # is more likely than several.
         still: list[Finding | None] = []
         try:
-            for motor in range(4):
+            for motor in range(len(self._board.letters)):
                 self._take("", partial(self._turn, motor), still.append)
                 while still and not all(map(stands, self._channels)):
                     self._tell(still.pop(0))

@@ -14,7 +14,7 @@ from msgspec import Struct
 
 from acsard.checkup import outcomes
 from acsard.checkup.findings import Finding, motor_names
-from acsard.checkup.motion import BOOT_S, SHORT_MEASUREMENT_S, ZERO, BoardReply
+from acsard.checkup.motion import BOOT_S, SHORT_MEASUREMENT_S, BoardReply
 from acsard.core.config.settings import McuConfig
 from acsard.core.link.codec import Motors
 from acsard.core.link.session import IDENTITY
@@ -54,8 +54,8 @@ class Restart(Struct, frozen=True):
     """One restart of the board."""
 
     sign: str  # the observation that shows the restart, in words
-    # Speeds that were commanded shortly before the restart, rad/s; zeros if no motor turned.
-    turned: Motors = ZERO
+    # Speeds that were commanded shortly before the restart, rad/s; empty if no motor turned.
+    turned: Motors = ()
     # Longest time without a line to the board, from the board's last reply to the restart.
     silent_s: Seconds = 0.0
     # Cause of the restart as the board reports it, or "" if the board does not report a cause.
@@ -77,7 +77,7 @@ class Restarts:
         # Whether `check_line` reports restarts. If false, `check_line` always returns None.
         self.watched = True
         self._asked_s = self._turned_s = float("-inf")
-        self._turned: Motors = ZERO  # the last commanded speeds, rad/s, that were not all zero
+        self._turned: Motors = ()  # the last commanded speeds, rad/s, that were not all zero
         self._sent_s: float | None = None
         self._silent_s = 0.0  # longest time between two sent lines since the board's last reply
         self._unanswered = 0
@@ -115,7 +115,7 @@ class Restarts:
         if not (sign and self.watched):
             return None
         heard_s = float("inf") if self._replied_s is None else self._replied_s
-        turned = self._turned if self._turned_s > heard_s - SHORT_MEASUREMENT_S else ZERO
+        turned = self._turned if self._turned_s > heard_s - SHORT_MEASUREMENT_S else ()
         return Restart(sign, turned, self._silence_s(at_s), cause([line]))
 
     def _silence_s(self, at_s: float) -> float:
@@ -184,7 +184,7 @@ def _silent(restarts: Sequence[Restart]) -> bool:
 
 
 def _restart_texts(mcu: McuConfig, restart: Restart) -> tuple[str, str]:
-    turned = [motor for motor in range(4) if restart.turned[motor]]
+    turned = [motor for motor, speed in enumerate(restart.turned) if speed]
     when = f"{motor_names(mcu, turned, ', ')} turned" if turned else "no motor turned"
     return when, restart.sign + (f" (reset={restart.cause})" if restart.cause else "")
 

@@ -20,7 +20,6 @@ from acsard.checkup.findings import Finding, StoppedError
 from acsard.checkup.motion import BoardReply
 from acsard.checkup.motor_channels import run_up
 from acsard.core.config.wire_time import FIELD_VALUES
-from acsard.core.link.codec import LETTERS
 from acsard.core.values import Seconds
 
 # Kinds of damaged lines that must not feed the watchdog. The check sends lines of these kinds.
@@ -68,7 +67,7 @@ def finding(board: Board, motors: Sequence[int]) -> Finding:
     judged = _judged(least_s, most_s)
     if judged.verdict == "FAIL":
         return judged
-    lines = damage.broken_lines(board.comma, board.sealed, motors)
+    lines = damage.broken_lines(board, motors)
     broken = cycle(line for what, line in lines if what in DAMAGE_KINDS)
     fed = run(board, motors, max(motion.WATCHDOG_SILENCE_S, 2 * most_s) + stop.slow_s, broken)
     if fed.ran_s >= 0.75 * fed.silent_s:
@@ -151,10 +150,10 @@ def run(board: Board, motors: Sequence[int], length_s: float, instead: Iterable[
     half of the commanded speed.
     """
     began_s = board.now_s
-    full = run_up(board, motion.only(motors))
+    full = run_up(board, board.only(motors))
     if max(abs(full[motor]) for motor in motors) < motion.SPEED / 2:
         board.stop_motors()
-        letters = ", ".join(LETTERS[motor] for motor in motors)
+        letters = ", ".join(board.letters[motor] for motor in motors)
         raise StoppedError(outcomes.find("watchdog: weak", letters=letters))
     # The ramp is over in the second half of the time since `began_s`.
     grain_s = motion.grain_s(motion.since(board.replies, (began_s + board.now_s) / 2), motors)
@@ -178,7 +177,7 @@ def run(board: Board, motors: Sequence[int], length_s: float, instead: Iterable[
         not board.own_clock and course[0].at_s < told_s + motion.LINE_PERIOD_S + 2 * board.gap_s
     )
     since_s = course[0].at_s if answered else told_s
-    ran = motion.covered(board.replies, since_s, _per_turn(board, motors))
+    ran = motion.covered(board.replies, board.zero, since_s, _per_turn(board, motors))
     ran_s = max(abs(ran[m] / full[m]) for m in motors if abs(full[m]) >= motion.SPEED / 2)
     return Run(silent_s, ran_s, slow_s, first, second, grain_s)
 

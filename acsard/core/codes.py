@@ -289,8 +289,8 @@ reply_period
 received_nothing
     no link to the microcontroller: {received};
     -> does the board have power, is mcu.port its port, is mcu.baud_rate right, are TX and RX
-    swapped, does another program read the port (`acsard doctor`){firmware}? `acsard mcu check`
-    finds out more
+    swapped, are its letters those of mcu.wheels, does another program read the port (`acsard
+    doctor`){firmware}? `acsard mcu check` finds out more
 received_statuses
     no link to the microcontroller: {received};
     -> is TX of this computer connected to RX of the board? `acsard mcu check` finds out more
@@ -305,8 +305,8 @@ received_form
     digits, a point and two digits in each figure, without spaces
 received_letters
     no link to the microcontroller: {received};
-    -> the lines are whole, but do not name each motor of mcu.wheels once: write the letters of the
-    board's lines into [mcu.wheels], of four wheels, or of `left` and `right` if two are driven
+    -> the lines are whole, but do not name each motor of mcu.wheels once: {wheels}; `acsard mcu
+    check` then finds out which motor turns which wheel
 received_cut
     no link to the microcontroller: {received};
     -> does the board cut its lines short, or omit the line ends? `acsard mcu check` finds out more

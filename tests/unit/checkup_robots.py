@@ -11,18 +11,22 @@ from contextlib import ExitStack, contextmanager
 from typing import Any
 
 import msgspec
+import pytest
 
 from acsard.checkup import checkup_report, procedure
 from acsard.checkup.board import Board
 from acsard.checkup.findings import Finding
-from acsard.core.config.settings import Config
+from acsard.core.config.settings import Config, McuConfig, WheelMap
 from acsard.core.config.simulated_faults import parse
 from acsard.core.simulator.fake_mcu import FakeMcu
 from acsard.core.simulator.virtual_wire import VirtualWire
 
 MS = 1_000_000
 
-SHORT = dict(zip(("fr", "fl", "rl", "rr"), range(4), strict=True))
+TWO = Config(mcu=McuConfig(wheels=WheelMap(left="+l", right="+r")))
+
+FOUR_AND_TWO = pytest.mark.parametrize("config", [Config(), TWO], ids=["four", "two"])
+"""The tests of what the check does for a robot with four driven wheels and with two."""
 
 
 class Robot(VirtualWire):
@@ -181,7 +185,7 @@ class Person(Nobody):
             return "ready"
         if "forward" in answers:
             return "forward" if next(iter(turns.values())) else "back"
-        names = list(SHORT)
+        names = ("r", "l") if "r" in answers else ("fr", "fl", "rl", "rr")
         return names[next(iter(turns))] if turns else "none"
 
 

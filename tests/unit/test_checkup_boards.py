@@ -14,7 +14,7 @@ from typing import Any
 import pytest
 
 from acsard.checkup import inputs
-from acsard.checkup.findings import Finding
+from acsard.checkup.findings import Finding, motor_name
 from acsard.core.config.settings import (
     Config,
     FeedbackConfig,
@@ -24,13 +24,15 @@ from acsard.core.config.settings import (
     SimConfig,
     WheelMap,
 )
+from acsard.core.simulator import protocol
 from acsard.core.values import NS_PER_S
 from tests.each import each
-from tests.unit.checkup_robots import Checked, Nobody, Person, Robot
+from tests.unit.checkup_robots import FOUR_AND_TWO, Checked, Nobody, Person, Robot
+from tests.unit.checkup_robots import TWO as TWO_WHEELS
 
 WORDS = Path(__file__).with_name("words")
 
-SPEED = re.compile(rb"[abcd][pn](\d\d\.\d\d)")
+SPEED = re.compile(rb"[a-z][pn](\d\d\.\d\d)")
 COARSE = Config(sim=SimConfig(encoder_counts=16))
 HEAVY = Config(sim=SimConfig(motor_time_constant=1.0))
 WIRED = Config(mcu=McuConfig(wheels=WheelMap("-c", "+d", "-a", "+b")))
@@ -95,6 +97,18 @@ BOARDS: dict[str, dict[str, tuple[str, dict[str, Any], bool]]] = {
                         "stuck_encoder=a", "reversed_wheel=a", "swapped_wheels=b:d",
                         "swapped_motors=a:b", "swapped_encoders=c:d"]},
         "any wiring": ("plain_only", {"config": WIRED, "wheels": WheelMap()}, True),
+    },
+    "two_wheels": {
+        "plain": ("plain_only", {"config": TWO_WHEELS}, True),
+        **{part: (part, {"config": TWO_WHEELS}, True)
+           for part in ["comma_latched", "no_watchdog", "watchdog_fed_by_bad_lines",
+                        "dead_motor=r", "swapped_encoders=l:r", "reversed_wheel=l"]},
+        "counts, in use": (
+            "", {"config": TWO_WHEELS, "link_check": "on", "encoder_counts": 3200}, False),
+        "any wiring": ("", {"config": TWO_WHEELS, "wheels": WheelMap(left="-r", right="+l")}, True),
+        "other letters": ("free_running", {"config": TWO_WHEELS, "wheels": WheelMap()}, False),
+        "letters of four": (
+            "free_running", {"wheels": TWO_WHEELS.mcu.wheels}, False),
     },
     "firmware": {
         "plain": ("plain_only", {}, False),
@@ -164,7 +178,7 @@ def lines(finding: Finding) -> Iterator[str]:
         yield f"        -> {finding.mend}"
 
 
-DAILY = ("good", "motors", "hardware")
+DAILY = ("good", "motors", "hardware", "two_wheels")
 
 
 @pytest.mark.parametrize(
@@ -193,17 +207,48 @@ def test_the_check_names_each_fault_and_nothing_else(
     approved(WORDS / f"checkup_{page}.txt", text)
 
 
-def test_an_encoder_that_moves_while_no_wheel_turns_fails_its_motor() -> None:
-    robot = Robot("plain_only")
+@FOUR_AND_TWO
+def test_an_encoder_that_moves_while_no_wheel_turns_fails_its_motor(config: Config) -> None:
+    robot, motor = Robot("plain_only", config=config), f"motor {config.mcu.wheels.letters[1]}"
 
     class Watching(Person):
         def ask(self, question: str, answers: Sequence[str]) -> str | None:
             answer = super().ask(question, answers)
-            return "none" if "did motor b turn" in question else answer
+            return "none" if f"did {motor} turn" in question else answer
 
     checked = Checked(robot, Watching(robot))
-    assert checked.failed == ["motor b (front left)"]
-    assert "you saw no wheel turn" in checked["motor b"].text
+    assert checked.failed == [motor_name(config.mcu, 1)]
+    assert "you saw no wheel turn" in checked[motor].text
+
+
+class Coupled(Robot):
+    """A robot whose firmware turns the motors of each of these groups with their mean speed."""
+
+    def __init__(self, groups: Sequence[Sequence[int]], *faults: str, config: Config) -> None:
+        super().__init__(*faults, config=config)
+
+        def understand(line: bytes) -> protocol.BoardCommand | None:
+            command = protocol.reference(line, self.mcu.letters)
+            values = command.values if command else {}
+            for group in groups if values else ():
+                mean = sum(values[motor] for motor in group) / len(group)
+                values.update(dict.fromkeys(group, mean))
+            return command
+
+        vars(self.mcu)["understand"] = understand
+
+
+@FOUR_AND_TWO
+@pytest.mark.parametrize(("fault", "verdict"), [((), "PASS"), (("no_watchdog",), "FAIL")])
+def test_coupled_motors_show_the_watchdog_too(
+    fault: tuple[str, ...], verdict: str, config: Config
+) -> None:
+    groups = [(0, 3), (1, 2)] if config == Config() else [(0, 1)]
+    checked = Checked(Coupled(groups, *fault, config=config))
+    assert checked.failed[:1] == [motor_name(config.mcu, 0)]
+    assert "are wheels coupled" in checked[motor_name(config.mcu, 0)].mend
+    assert [checked[row].verdict for row in ("watchdog", "damaged lines")] == [verdict, "PASS"]
+    assert not checked.left_turning
 
 
 def test_an_echo_is_not_taken_for_a_robot() -> None:

@@ -5,16 +5,19 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Sequence
+from typing import Any
 
 import pytest
+from msgspec import structs
 
 from acsard.checkup import procedure
 from acsard.checkup.board import FINAL_ZEROS
-from acsard.checkup.findings import Finding, WireLostError
-from acsard.core.config.settings import Config, SimConfig, WheelMap
-from acsard.core.link.codec import Codec
+from acsard.checkup.findings import Finding, WireLostError, motor_name
+from acsard.core.config.settings import Config, SimConfig
+from acsard.core.link.codec import MotorCodec
 from acsard.core.simulator import protocol
 from tests.unit.checkup_robots import (
+    FOUR_AND_TWO,
     MS,
     Checked,
     Nobody,
@@ -23,23 +26,26 @@ from tests.unit.checkup_robots import (
 )
 
 
-def zero(line: bytes) -> bool:
-    return line in (Codec(WheelMap()).stop, Codec(WheelMap(), True).stop, b"\r\n")
+def stop_lines(config: Config) -> tuple[bytes, bytes]:
+    """Return the lines of zeros of the motors, without and with a comma at the end."""
+    letters = config.mcu.wheels.letters
+    return MotorCodec(letters).stop, MotorCodec(letters, True).stop
 
 
-def test_only_zeros_are_sent_until_the_wheels_are_confirmed_to_be_lifted() -> None:
-    robot = Robot()
+@FOUR_AND_TWO
+def test_only_zeros_are_sent_until_the_wheels_are_confirmed_to_be_lifted(config: Config) -> None:
+    robot, zeros = Robot(config=config), (*stop_lines(config), b"\r\n")
 
     class Refuses(Nobody):
         def ask(self, question: str, answers: Sequence[str]) -> str | None:
-            assert all(zero(line) for data in robot.sent for line in data.splitlines(True))
+            assert all(line in zeros for data in robot.sent for line in data.splitlines(True))
             assert answers == ("lifted",)
             return None
 
     findings: list[Finding] = []
     procedure.run(robot, Refuses(), robot.config, findings.append)
     assert [finding.name for finding in findings if finding.verdict != "SKIPPED"] == ["wheels"]
-    assert all(zero(line) for data in robot.sent for line in data.splitlines(True))
+    assert all(line in zeros for data in robot.sent for line in data.splitlines(True))
     assert not robot.is_open
 
 
@@ -60,7 +66,7 @@ def test_a_q_typed_while_a_motor_turns_ends_the_check(typed: str) -> None:
     with robot.faulty(), pytest.raises(KeyboardInterrupt):
         procedure.run(robot, Quits(robot), robot.config, lambda finding: None)
     assert questions == [procedure.CONFIRMATION]
-    assert b"".join(robot.sent[-5:]).count(Codec(WheelMap()).stop) == FINAL_ZEROS
+    assert b"".join(robot.sent[-5:]).count(stop_lines(robot.config)[0]) == FINAL_ZEROS
     assert robot.later() == [0.0] * 4
 
 
@@ -146,8 +152,8 @@ def test_before_a_wheel_has_turned_only_a_long_stall_ends_the_check(
 class Trouble(Robot):
     """A robot that raises an error at the n-th line."""
 
-    def __init__(self, number: int, error: BaseException, *faults: str) -> None:
-        super().__init__(*faults)
+    def __init__(self, number: int, error: BaseException, *faults: str, **how: Any) -> None:
+        super().__init__(*faults, **how)
         self._number, self._error = number, error
 
     def send(self, data: bytes) -> None:
@@ -157,17 +163,18 @@ class Trouble(Robot):
 
 
 @pytest.mark.variations(3)
+@FOUR_AND_TWO
 @pytest.mark.parametrize("fault", ["no_sample", "comma_latched"])
 @pytest.mark.parametrize("number", range(2, 560, 43))
 def test_whatever_ends_the_check_the_last_lines_are_zeros_in_both_forms(
-    fault: str, number: int
+    fault: str, number: int, config: Config
 ) -> None:
     error = KeyboardInterrupt if number % 2 else RuntimeError
-    robot = Trouble(number, error(), fault, "no_watchdog")
+    robot = Trouble(number, error(), fault, "no_watchdog", config=config)
     with robot.faulty(), pytest.raises(error):
         procedure.run(robot, Nobody(), robot.config, lambda finding: None)
     last = b"".join(robot.sent[-5:])
-    assert last.count(Codec(WheelMap()).stop) == last.count(Codec(WheelMap(), True).stop) == 5
+    assert [last.count(line) for line in stop_lines(config)] == [5, 5]
     with robot.faulty():
         assert robot.later() == [0.0] * 4
     assert not robot.is_open
@@ -187,7 +194,7 @@ def test_a_signal_during_the_last_zeros_does_not_stop_them() -> None:
     robot = Interrupted("plain_only")
     with robot.faulty(), pytest.raises(KeyboardInterrupt):
         procedure.run(robot, Nobody(), robot.config, lambda finding: None)
-    assert b"".join(robot.sent[-5:]).count(Codec(WheelMap(), True).stop) == 5
+    assert b"".join(robot.sent[-5:]).count(stop_lines(robot.config)[1]) == 5
     assert not robot.is_open
 
 
@@ -210,20 +217,23 @@ class Regulates(Robot):
 
     FULL = 20.0
 
-    def __init__(self, *faults: str, lag: float = 0.3) -> None:
-        super().__init__(*faults, config=Config(sim=SimConfig(motor_time_constant=lag)))
+    def __init__(self, *faults: str, config: Config, lag: float = 0.3) -> None:
+        super().__init__(
+            *faults, config=structs.replace(config, sim=SimConfig(motor_time_constant=lag))
+        )
         self.full_s = 0.0
         """Time for which a motor was faster than 6 rad/s, in seconds."""
         self.mcu.switches.firmware = "plain_only"
         vars(self.mcu)["understand"] = self._regulated
 
     def _regulated(self, line: bytes) -> protocol.BoardCommand | None:
-        command = protocol.reference(line, "abcd")
+        command = protocol.reference(line, self.mcu.letters)
         if command is None:
             return None
         for motor, target in command.values.items():
             sign = 0 if self.mcu.switches.stuck == motor else self.mcu.switches.encoder_signs[motor]
-            speed = self.mcu.vehicle.speeds[motor]
+            (wheel, *_), _ = self.mcu._wiring[motor]
+            speed = self.mcu.vehicle.speeds[wheel]
             error = target - sign * speed
             if sign != 1 and abs(error) > 0.1:
                 command.values[motor] = math.copysign(self.FULL, error)
@@ -238,14 +248,17 @@ class Regulates(Robot):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("fault", "most_s"), [("stuck_encoder=b", 0.8), ("reversed_encoder=b", 0.9)]
-)
-def test_firmware_that_regulates_is_not_left_at_full_speed(fault: str, most_s: float) -> None:
-    robot = Regulates(fault)
+@FOUR_AND_TWO
+@pytest.mark.parametrize(("fault", "most_s"), [("stuck_encoder", 0.8), ("reversed_encoder", 0.9)])
+def test_firmware_that_regulates_is_not_left_at_full_speed(
+    fault: str, most_s: float, config: Config
+) -> None:
+    motor = len(config.mcu.wheels.names) - 2  # for the last motor the check tries both line ends
+    name = motor_name(config.mcu, motor)
+    robot = Regulates(f"{fault}={config.mcu.wheels.letters[motor]}", config=config)
     checked = Checked(robot)
-    assert checked.failed == ["motor b (front left)"]
-    assert checked["motor b"].figure.endswith("probed")
+    assert checked.failed == [name]
+    assert checked[name].figure.endswith("probed")
     assert checked["watchdog"].verdict == "PASS"
     assert robot.full_s < most_s
     assert not checked.left_turning
@@ -263,13 +276,15 @@ def test_after_a_runaway_zeros_are_sent_once_and_then_nothing() -> None:
     assert robot.sent[-1].startswith(b"\r\nap00.00")
 
 
-def test_no_motor_is_commanded_above_3_rad_s_or_for_4_s() -> None:
-    robot = Robot("plain_only", "no_watchdog")
+@FOUR_AND_TWO
+def test_no_motor_is_commanded_above_3_rad_s_or_for_4_s(config: Config) -> None:
+    robot = Robot("plain_only", "no_watchdog", config=config)
     Checked(robot)
+    letters = config.mcu.wheels.letters
     turning_since: dict[str, int] = {}
     for at_ns, line in robot.mcu.heard:
         tokens = line.rstrip(b",\r\n").split(b",")
-        if len(tokens) != 4 or not line.startswith(b"a") or b"x" in line:
+        if len(tokens) != len(letters) or line[:1] != letters[:1].encode() or b"x" in line:
             continue
         speeds = [float(token[2:7]) for token in tokens if len(token) == 7]
         assert max(speeds) <= 3.0

@@ -17,7 +17,7 @@ from acsard.core.config.settings import Config, SimConfig
 from acsard.core.link.checked_line import Reading
 from acsard.core.simulator import protocol
 from tests.each import each
-from tests.unit.checkup_robots import Robot
+from tests.unit.checkup_robots import FOUR_AND_TWO, Robot
 
 # Counts.
 
@@ -63,15 +63,14 @@ def test_wrong_counts_of_one_motor_are_found(share: float, words: str) -> None:
 # The watchdog.
 
 
-ALL = (0, 1, 2, 3)
-
-
 class ByItsOwnClock(Robot):
     """A robot whose firmware measures each speed over one of its own fixed control periods."""
 
     def __init__(self, *faults: str, config: Config | None = None) -> None:
         super().__init__(*faults, config=config)
-        self.mcu._speeds = lambda now_ns: list(self.mcu.vehicle.speeds)  # type: ignore[method-assign]
+        self.mcu._speeds = lambda now_ns: [  # type: ignore[method-assign]
+            sign * self.mcu.vehicle.speeds[wheel] for (wheel, *_), sign in self.mcu._wiring
+        ]
 
 
 @contextmanager
@@ -80,7 +79,7 @@ def turned(robot: Robot) -> Iterator[Board]:
     with robot.board() as board:
         dialect.rate(board)
         dialect.check(board)
-        for motor in ALL:
+        for motor in range(len(board.letters)):
             turn(board, motor, 3.0)
             board.stop_motors()
         yield board
@@ -89,19 +88,20 @@ def turned(robot: Robot) -> Iterator[Board]:
 
 def measured(robot: Robot) -> tuple[str, str]:
     with turned(robot) as board:
-        finding = watchdog.finding(board, ALL)
+        finding = watchdog.finding(board, range(len(board.letters)))
     assert robot.later() == [0.0] * 4
     return finding.verdict, finding.figure
 
 
 @pytest.mark.variations(3)
+@FOUR_AND_TWO
 @pytest.mark.parametrize("kind", [("plain_only",), ("no_sample",), (), ("free_running",)])
 @pytest.mark.parametrize("time_ms", [120, 450])
 @pytest.mark.parametrize("robot", [Robot, ByItsOwnClock])
 def test_a_watchdog_time_within_the_contract_is_measured_and_passes(
-    kind: tuple[str, ...], time_ms: int, robot: type[Robot]
+    kind: tuple[str, ...], time_ms: int, robot: type[Robot], config: Config
 ) -> None:
-    instance = robot(*kind)
+    instance = robot(*kind, config=config)
     instance.mcu.switches.watchdog_ns = time_ms * 1_000_000
     verdict, figure = measured(instance)
     value, _, about = figure.partition(" ms")
@@ -115,11 +115,16 @@ def test_a_watchdog_too_short_for_any_host_is_a_warning() -> None:
     assert measured(robot)[0] == "WARN"
 
 
-def test_firmware_that_obeys_broken_lines_never_gets_more_than_the_commanded_speed() -> None:
-    robot = Robot("comma_latched", trailing_comma=True)
+@FOUR_AND_TWO
+def test_firmware_that_obeys_broken_lines_never_gets_more_than_the_commanded_speed(
+    config: Config,
+) -> None:
+    robot = Robot("comma_latched", config=config, trailing_comma=True)
     with robot.board() as board:
-        assert watchdog.finding(board, ALL).figure.endswith("damaged lines keep it from acting")
-    commands = [protocol.latched(line, "abcd").values.values() for _, line in robot.mcu.heard]
+        figure = watchdog.finding(board, range(len(board.letters))).figure
+        assert figure.endswith("damaged lines keep it from acting")
+    letters = robot.mcu.letters
+    commands = [protocol.latched(line, letters).values.values() for _, line in robot.mcu.heard]
     assert max(abs(value) for values in commands for value in values) == SPEED
 
 

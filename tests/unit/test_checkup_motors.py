@@ -14,7 +14,7 @@ from acsard.core.config.settings import Config, McuConfig, SimConfig
 from acsard.core.link.checked_line import Reading
 from acsard.core.link.codec import Motors
 from tests.each import each
-from tests.unit.checkup_robots import Robot
+from tests.unit.checkup_robots import FOUR_AND_TWO, Robot
 
 # Speeds.
 
@@ -88,13 +88,15 @@ def test_the_speeds_of_the_encoders_decide_the_kind_and_verdict_of_a_motor(
     assert bool(finding.mend) is (kind != "right")
 
 
-def test_a_probe_is_short_and_commands_a_dead_motor_at_most_3_rad_s() -> None:
-    robot = Robot("plain_only", "dead_motor=b")
+@FOUR_AND_TWO
+def test_a_probe_is_short_and_commands_a_dead_motor_at_most_3_rad_s(config: Config) -> None:
+    letter = config.mcu.wheels.letters[1]
+    robot = Robot("plain_only", f"dead_motor={letter}", config=config)
     with robot.board() as board:
         began, before = robot.now_ns(), len(robot.sent)
-        assert probe(board, 1) == (0.0, 0.0, 0.0, 0.0)
-        lines = [line for line in robot.sent[before:] if b"bp00.00" not in line]
-        assert {line[8:15] for line in lines} == {b"bp01.50", b"bp03.00"}
+        assert probe(board, 1) == board.zero
+        lines = [line for line in robot.sent[before:] if f"{letter}p00.00".encode() not in line]
+        assert {line[8:15].decode() for line in lines} == {f"{letter}p01.50", f"{letter}p03.00"}
         assert len(lines) <= 2 * (SHORT_MEASUREMENT_S / board.period_s + 1)
         assert robot.now_ns() - began < 3e9
         assert probe(board, 0) is None

@@ -129,3 +129,6 @@ def test_the_wheel_and_sign_of_a_motor_are_the_configured_ones() -> None:
     wheels = [("rear_left", -1), ("rear_right", 1), ("front_right", -1), ("front_left", 1)]
     assert [wheel_of(turned, motor) for motor in range(4)] == wheels
     assert motor_name(turned, 0) == "motor a (rear left)"
+    two = McuConfig(wheels=WheelMap(left="-y", right="+x"))
+    assert [wheel_of(two, motor) for motor in range(2)] == [("right", 1), ("left", -1)]
+    assert motor_name(two, 1) == "motor y (left)"

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import pytest
 
-from acsard.checkup.motion import ZERO, BoardReply
+from acsard.checkup.motion import BoardReply
 from acsard.checkup.procedure import AGAIN, MOST
 from acsard.checkup.restarts import (
     CLOCK_RANGE_MS,
@@ -23,6 +23,8 @@ from tests.unit.checkup_robots import MS, Checked, Robot
 
 NAME = IDENTITY + b"1 counts=3200"
 
+
+ZERO = (0.0, 0.0, 0.0, 0.0)
 
 TEXT = b"Booting v2"
 

@@ -41,8 +41,11 @@ def called(where: Path, *words: str, text: str = "") -> int:
 
 
 @pytest.mark.slow
-def test_json_is_one_object(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert called(tmp_path, "--port", "sim", "--yes", "--json") == 0
+@pytest.mark.parametrize("wheels", ["", '[mcu.wheels]\nleft = "-m"\nright = "+k"\n'])
+def test_json_is_one_object(
+    wheels: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert called(tmp_path, "--port", "sim", "--yes", "--json", text=wheels) == 0
     out, err = capsys.readouterr()
     report = json.loads(out)
     assert err == ""

@@ -48,6 +48,11 @@ HEARD: dict[str, tuple[bytes, str, str]] = {
         "4 lines received, only 1 good, the last bad one is `[I][main] heap 182344`"
     ),
     "another form": (b"ap 0.00,bp 0.00,cp 0.00,dp 0.00\r\n", "form", "none good"),
+    "two other motors": (b"rp12.50,lp08.75,\r\n", "letters", "none good"),
+    "four other motors": (b"ep00.00,fp00.00,gp00.00,hp00.00#07*0000\r\n", "letters", "none good"),
+    "a motor twice": (b"ap00.00,ap00.00,bp00.00,dp00.00\r\n", "letters", "none good"),
+    "three values": (b"ap00.00,bp00.00,cp00.00\r\n" * 4, "cut", "none good"),
+    "a wrong check": (b"ap00.00,bp00.00,cp00.00,dp00.00#07*0000\r\n", "foreign", "none good"),
     "some good": (
         STOP + b"ap?\r\n", "few", "2 lines received, only 1 good, the last bad one is `ap?`"
     ),
@@ -62,10 +67,31 @@ def test_the_diagnosis_says_what_was_received_and_how_it_looks(
     heard = Traffic()
     heard.take(data)
     for line, _ in LineReader().feed(data):
-        heard.line(line, line + b"\r\n" == STOP, 4)
+        heard.line(line, line + b"\r\n" == STOP, "abcd")
     assert heard.code == heard.diagnosis().code == f"received_{looks}"
     assert counted in heard.counted
     assert heard.counted in heard.diagnosis().text
+
+
+@each(
+    ("heard", "remedy"),
+    [
+        ("two other motors", 'write left = "+l", right = "+r" into [mcu.wheels]'),
+        (
+            "four other motors",
+            'front_left = "+f", rear_left = "+g", rear_right = "+h", right = ""',
+        ),
+        ("a motor twice", "the firmware must name each motor once"),
+    ],
+)
+def test_a_board_of_other_motors_is_answered_with_the_lines_to_write(
+    heard: str, remedy: str
+) -> None:
+    traffic = Traffic()
+    data, _, _ = HEARD[heard]
+    traffic.take(data)
+    traffic.line(data.rstrip(), False, "abcd")
+    assert remedy in traffic.diagnosis().text
 
 
 def test_no_line_that_the_board_can_send_takes_long_to_classify() -> None:
@@ -75,7 +101,7 @@ def test_no_line_that_the_board_can_send_takes_long_to_classify() -> None:
         def once() -> int:
             start = process_time_ns()
             for _ in range(5):
-                Traffic().line(line, False, 4)
+                Traffic().line(line, False, "abcd")
             return process_time_ns() - start
 
         return min(once() for _ in range(3))
@@ -102,7 +128,7 @@ def test_it_comes_after_three_seconds_and_again_only_when_it_changes() -> None:
             assert silence.complete is not None
             reports.append((tick, silence.complete.code))
     assert reports == [(10, "received_nothing"), (60, "received_garbage")]
-    silence.now.line(STOP, True, 4)
+    silence.now.line(STOP, True, "abcd")
     silence.forget()
     assert (silence.complete, silence.now) == (None, Traffic())
     assert not silence.diagnose(10 * FIRST_DIAGNOSIS_NS)

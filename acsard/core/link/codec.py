@@ -17,8 +17,6 @@ from typing import Literal
 from acsard.core.config.settings import WheelMap
 from acsard.core.values import STILL, AcsardError, Wheels4, WheelSpeeds
 
-LETTERS = "abcd"
-
 Motors = tuple[float, ...]  # a value of each motor, by letter, with the board's sign
 
 MAX_SPEED = 99.99  # rad/s, two digits before the point and two after it

@@ -17,7 +17,7 @@ from acsard.core.link.codec import SPEED
 from acsard.core.link.link_setup import LinkSetup
 from acsard.core.link.link_state import Link, LinkState
 from acsard.core.link.step_times import StepTimes
-from acsard.core.values import NS_PER_S, Event, Ns
+from acsard.core.values import NS_PER_S, TWO_WHEELS, WHEELS, Event, Ns
 
 BUSY_ADVICE = CODES["host_late"].advice
 
@@ -45,9 +45,10 @@ CHECKED_FIRMWARE = ', does its firmware support mcu.link_check = "on" (else writ
 
 # Of any motors: which ones a robot has is declared.
 _LETTER = rb"[a-moq-z]"
-_VALUES = _LETTER + rb"[pn]" + SPEED + rb"(?:, *" + _LETTER + rb"[pn]" + SPEED + rb"){1,3}"
-_RIGHT = re.compile(_VALUES)
-_OTHER_LETTERS = re.compile(_VALUES + rb"(?:, *)?(?:#[0-9A-F@*]*)?")
+_PAIR = _LETTER + rb"[pn]" + SPEED + rb", *" + _LETTER + rb"[pn]" + SPEED
+_RIGHT = {2: re.compile(_PAIR), 4: re.compile(_PAIR + rb", *" + _PAIR)}  # by the number of motors
+_WHOLE = re.compile(rb"(%b(?:, *%b)?)(?:, *)?(?:#[0-9A-F@*]*)?" % (_PAIR, _PAIR))
+_MOTOR = re.compile(rb"([a-z])[pn]")
 # By the number of motors. Each byte has one place in it, so that no line makes the search for a
 # match long.
 _OTHER_FORMS = {
@@ -92,7 +93,9 @@ class Traffic(Struct):
     texts: int = 0  # bad lines for which `is_text` holds
     formed: int = 0  # bad lines that are replies in another form
     lettered: int = 0  # bad lines that are replies of other motors
+    motors: str = ""  # letters of the last such line, sorted
     last: bytes = b""  # last bad line, or incomplete bytes
+    within: bool = False  # the last bad line contains the values of all motors
     late_s: float = 0.0  # longest time in which this computer did not run the daemon
 
     def take(self, data: bytes) -> None:
@@ -101,16 +104,18 @@ class Traffic(Struct):
         if not self.lines:
             self.last = (self.last + data)[-MAX_SHOWN_BYTES:]
 
-    def line(self, line: bytes, good: bool, motors: int) -> None:
-        """Add a line without its end; `good` if it is a valid reply of so many motors."""
+    def line(self, line: bytes, good: bool, letters: str) -> None:
+        """Add a line without its end; `good` if it is a valid reply of the motors `letters`."""
         self.lines += 1
         self.good += good
         if not good:
-            self.last = line
+            self.last, self.within = line, bool(_RIGHT[len(letters)].search(line))
             self.texts += is_text(line)
-            if _OTHER_LETTERS.fullmatch(line):
-                self.lettered += 1
-            elif _OTHER_FORMS[motors].fullmatch(line):
+            if whole := _WHOLE.fullmatch(line):
+                motors = b"".join(sorted(_MOTOR.findall(whole[1]))).decode()
+                if motors != letters:
+                    self.lettered, self.motors = self.lettered + 1, motors
+            elif _OTHER_FORMS[len(letters)].fullmatch(line):
                 self.formed += 1
 
     @property
@@ -128,7 +133,7 @@ class Traffic(Struct):
             return "received_letters"
         if self.good:
             return "received_few" if bad else "received_sparse"
-        if self.lines and _RIGHT.search(self.last):
+        if self.within:
             return "received_foreign"
         return "received_cut" if _PIECE.fullmatch(self.last) else "received_garbage"
 
@@ -153,13 +158,25 @@ class Traffic(Struct):
         last = f", the {which} is `{bad}`" if self.good < self.lines else ""
         return f"{many(self.lines, 'line')} received, {good}{last}"
 
+    @property
+    def wheels(self) -> str:
+        """What to do about a board that names other motors than the configuration, as text."""
+        motors = self.motors
+        if len({*motors}) < len(motors):
+            return "the firmware must name each motor once"
+        names = WHEELS if len(motors) == len(WHEELS) else TWO_WHEELS[::-1]
+        entries = [f'{name} = "+{motor}"' for name, motor in zip(names, motors, strict=False)]
+        if names == WHEELS:
+            entries += [f'{name} = ""' for name in TWO_WHEELS]
+        return f"write {', '.join(entries)} into [mcu.wheels]"
+
     def diagnosis(self, checked: bool = False) -> Reason:
         """Return the complete diagnosis, for `state`; `checked` is `mcu.checked`."""
         if self.code == "received_sparse" and self.late_s:
             received = "too few lines for a link"
             return sentence("host_late", seconds=self.late_s, received=received)
         firmware = CHECKED_FIRMWARE if checked else ""
-        return sentence(self.code, received=self.counted, firmware=firmware)
+        return sentence(self.code, received=self.counted, firmware=firmware, wheels=self.wheels)
 
 
 class SilenceDiagnosis(Struct):

@@ -351,7 +351,7 @@ class McuSession(Struct):
             else:
                 feedback.append(reply)
             if link.state != "up":
-                self._silence.now.line(line, reply is not None, len(setup.codec.letters))
+                self._silence.now.line(line, reply is not None, setup.codec.letters)
         return feedback
 
     def _without_remarks(
