@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 
 import pytest
 
-from acsard.checkup import dialect, encoder_counts, line_loss, watchdog
+from acsard.checkup import damage, dialect, encoder_counts, line_loss, watchdog
 from acsard.checkup.board import Board
 from acsard.checkup.findings import StoppedError
 from acsard.checkup.motion import SPEED, BoardReply
 from acsard.checkup.motor_channels import turn
-from acsard.core.config.settings import Config, SimConfig
+from acsard.core.config.settings import Config, McuConfig, SimConfig, WheelMap
 from acsard.core.link.checked_line import Reading
 from acsard.core.simulator import protocol
 from tests.each import each
@@ -150,6 +151,26 @@ def test_a_time_measured_too_coarsely_to_judge_does_not_pass(
 
 
 # Lines.
+
+
+@each("wheels", [WheelMap(), WheelMap("+x", "+w", "+v", "+z"), WheelMap(left="+x", right="+y")])
+@each("comma", [False, True])
+def test_each_damaged_line_turns_motors_and_is_invalid_as_its_name_says(
+    wheels: WheelMap, comma: bool
+) -> None:
+    letters = wheels.letters
+    with Robot(config=Config(mcu=McuConfig(wheels=wheels, trailing_comma=comma))).board() as board:
+        board.sealed = True
+        lines = damage.broken_lines(board, range(len(letters)))
+    assert len({line for _, line in lines}) == len(lines) == 12
+    for name, line in lines:
+        assert b"p03" in line
+        assert line.endswith(b"\r\n")
+        assert protocol.reference(line, letters) is None, name
+        if name.startswith("cut"):
+            assert re.search(rb"[a-z]p[0-9.]{1,4}\r\n", line), name
+        if name == "cut inside the last number":
+            assert line.count(b",") == len(letters) - 1
 
 
 def run_earlier_steps(board: Board) -> None:
