@@ -225,7 +225,7 @@ def _line_angle(front: Metres, rear: Metres, wheelbase: Metres) -> Rad:
     sine = (rear - front) / wheelbase
     if abs(sine) > 0.98:
         raise LogError(
-            f"two wheels that are {wheelbase * 1000:.0f} mm apart cannot be {front * 1000:.0f} mm "
+            f"two points that are {wheelbase * 1000:.0f} mm apart cannot be {front * 1000:.0f} mm "
             f"and {rear * 1000:.0f} mm from the line"
         )
     return math.asin(sine)

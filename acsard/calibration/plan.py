@@ -71,13 +71,14 @@ FROM_MARK = NumberQuestion(
 )  # fmt: skip
 TO_LINE = tuple(
     NumberQuestion(
-        f"How far is the {end} left wheel from the line, measured at a right angle to the line?",
+        f"How far is the {end} point from the line, measured at a right angle to the line?",
         "mm", 0, 1500, name=end,
     )
     for end in ("front", "rear")
 )  # fmt: skip
 WHEELBASE = NumberQuestion(
-    "How far apart are the front left and the rear left wheel, axle to axle?", "mm", 50, 2000,
+    "Choose two points on the left side of the robot, a front and a rear one, equally far to the "
+    "left: the axles of two wheels, or two screws. How far apart are they?", "mm", 50, 2000,
     name="wheelbase",
 )  # fmt: skip
 
@@ -211,8 +212,8 @@ def _tape(setup: Setup, track: float) -> tuple[Leg, ...]:
         Leg(
             "ahead",
             f"{_place(setup)} Draw or find a straight line on the floor, about 300 mm to the left "
-            "of the robot, along which the robot faces: its front left and its rear left wheel "
-            "have the same distance from the line, to the millimetre. Mark where one wheel stands. "
+            "of the robot, along which the robot faces: its front and its rear point have the "
+            "same distance from the line, to the millimetre. Mark where one wheel stands. "
             f"{STAY}The robot drives {setup.length:.2f} m straight ahead.",
             (setup.ahead(setup.length),), (FROM_MARK, *TO_LINE),
         ),

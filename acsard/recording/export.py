@@ -19,7 +19,17 @@ from acsard.core.config.settings import Config
 from acsard.core.robot import Robot
 from acsard.core.ros.channels import ENCODING, SCHEMA_ENCODING, Channel
 from acsard.core.ros.names import TYPE_HASHES, Qos
-from acsard.core.values import NS_PER_S, Estimate, GyroSample, Instant, News, Twist, WallNs
+from acsard.core.values import (
+    NS_PER_S,
+    TWO_WHEELS,
+    WHEELS,
+    Estimate,
+    GyroSample,
+    Instant,
+    News,
+    Twist,
+    WallNs,
+)
 from acsard.host.errors import RecordingError
 from acsard.host.version import version
 from acsard.recording.file import SUFFIX, Recording
@@ -156,8 +166,8 @@ def offered_qos(qos: Qos) -> str:
 
 # The table
 
-# For a calibration: s since 1970, rad/s of the wheels, and rad/s of the gyro.
-MEASURED_COLUMNS = ("t", "fr", "fl", "rl", "rr", "yaw_rate", "applied_linear", "applied_angular")
+# By the driven wheels, whose order is that of the values.
+WHEEL_COLUMNS = {WHEELS: ("fr", "fl", "rl", "rr"), TWO_WHEELS: TWO_WHEELS}
 
 # SI units; empty for a gyro sample.
 OUTPUT_COLUMNS = ("odom_x", "odom_y", "odom_yaw", "linear", "angular", "mode", "link", "source")
@@ -167,39 +177,52 @@ Cells = tuple[str, ...]
 
 def table(recording: Recording, other: Config | None = None) -> Iterator[Cells]:
     """Yield the header and the rows of the table of a recording. Raises `RecordingError`."""
-    yield MEASURED_COLUMNS + OUTPUT_COLUMNS
     playback = Playback(recording, other)
+    wheels = _wheel_columns(playback, recording, other)
+    yield measured_columns(wheels) + OUTPUT_COLUMNS
     for step, news in playback.steps():
         if recording.contains(step.now):
-            yield from _rows(step, news, playback.robot)
+            yield from _rows(step, news, playback.robot, len(wheels))
 
 
-def _rows(step: RecordedStep, news: News, robot: Robot) -> Iterator[Cells]:
+def _wheel_columns(playback: Playback, recording: Recording, other: Config | None) -> Cells:
+    with playback.errors():
+        head = recording.head()
+        config = other or (Config() if head is None else config_of(head))
+        return WHEEL_COLUMNS[config.mcu.wheels.names]
+
+
+def _rows(step: RecordedStep, news: News, robot: Robot, wheels: int) -> Iterator[Cells]:
     for sample in step.heard.gyro:
-        yield gyro_cells(sample, step.now) + ("",) * len(OUTPUT_COLUMNS)
+        yield gyro_cells(sample, step.now, wheels) + ("",) * len(OUTPUT_COLUMNS)
     status = robot.status
     for estimate in news.estimates:
         pose, twist = estimate.pose, estimate.twist
         yield (
-            *feedback_cells(estimate, robot.applied),
+            *feedback_cells(estimate, robot.applied, wheels),
             *[f"{value:.6f}" for value in (pose.x, pose.y, pose.yaw)],
             *[f"{value:.6g}" for value in (twist.linear, twist.angular)],
             status.mode, status.link, status.source,
         )  # fmt: skip
 
 
-def feedback_cells(estimate: Estimate, applied: Twist) -> Cells:
-    """Return the `MEASURED_COLUMNS` of a feedback line."""
-    wheels = [f"{speed:.6g}" for speed in estimate.speeds.as_tuple()]
+def measured_columns(wheels: Cells) -> Cells:
+    """Return those for a calibration: s since 1970, rad/s of the wheels, and rad/s of the gyro."""
+    return ("t", *wheels, "yaw_rate", "applied_linear", "applied_angular")
+
+
+def feedback_cells(estimate: Estimate, applied: Twist, wheels: int) -> Cells:
+    """Return the `measured_columns` of a feedback line."""
+    measured = [f"{speed:.6g}" for speed in estimate.speeds.as_tuple()[:wheels]]
     speeds = f"{applied.linear:.6g}", f"{applied.angular:.6g}"
-    return (_seconds(estimate.at.wall_ns), *wheels, "", *speeds)
+    return (_seconds(estimate.at.wall_ns), *measured, "", *speeds)
 
 
-def gyro_cells(sample: GyroSample, now: Instant) -> Cells:
-    """Return the `MEASURED_COLUMNS` of a gyro sample, at its stamp or else its arrival."""
+def gyro_cells(sample: GyroSample, now: Instant, wheels: int) -> Cells:
+    """Return the `measured_columns` of a gyro sample, at its stamp or else its arrival."""
     arrived_ns = sample.at_ns + now.wall_ns - now.mono_ns
     at_ns = arrived_ns if sample.stamp_ns is None else sample.stamp_ns
-    return (_seconds(at_ns), "", "", "", "", f"{sample.rate:.6g}", "", "")
+    return (_seconds(at_ns), *[""] * wheels, f"{sample.rate:.6g}", "", "")
 
 
 def _seconds(wall_ns: WallNs) -> str:
@@ -211,14 +234,16 @@ def calibration_csv(recording: Recording) -> bytes:
 
     Raises `RecordingError`, also without gyro samples.
     """
-    rows: list[Cells] = [MEASURED_COLUMNS]
     playback, has_gyro = Playback(recording), False
+    columns = _wheel_columns(playback, recording, None)
+    rows, wheels = [measured_columns(columns)], len(columns)
     for step, news in playback.steps():
         if playback.gaps:
             # A calibration compares whole drives, and part of this drive is missing.
             break
-        rows += [gyro_cells(sample, step.now) for sample in step.heard.gyro]
-        rows += [feedback_cells(estimate, playback.robot.applied) for estimate in news.estimates]
+        rows += [gyro_cells(sample, step.now, wheels) for sample in step.heard.gyro]
+        applied = playback.robot.applied
+        rows += [feedback_cells(estimate, applied, wheels) for estimate in news.estimates]
         has_gyro = has_gyro or bool(step.heard.gyro)
     if not has_gyro:
         names = ", ".join([path.name for path in recording.paths])

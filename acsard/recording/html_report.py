@@ -26,7 +26,7 @@ from msgspec import Struct
 from acsard.core.formatting import lasting, many, printable
 from acsard.core.messages.schema import JointState, Odometry, RobotState, TwistStamped
 from acsard.core.ros.shapes import LEVELS, Log
-from acsard.core.values import NS_PER_S, WHEELS
+from acsard.core.values import NS_PER_S, wheel_names
 from acsard.recording.published import Published
 
 # The file of the npm package plotly.js-basic-dist-min 4.1.1, which draws curves and bars.
@@ -361,11 +361,12 @@ def _columns(rows: Iterable[Row]) -> list[tuple[float, ...]]:
 
 def _diagrams(drawing: Drawing) -> Figure:
     bands = {name: spans for name, spans in drawing.bands.items() if any(s.kind for s in spans)}
+    wheels = wheel_names(len(drawing.wheels.last or ()) - 1)
     return _stacked(
         [
             Diagram("forward, m/s", _speeds(drawing, 1), _range(drawing, 1)),
             Diagram("turning, rad/s", _speeds(drawing, 2), _range(drawing, 2)),
-            Diagram("wheels, rad/s", _over_time(drawing.wheels, WHEELS), {}),
+            Diagram("wheels, rad/s", _over_time(drawing.wheels, wheels), {}),
             Diagram("per second", _over_time(drawing.counters, COUNTERS), {}),
             Diagram("", _bars(bands), _categories(bands)),
             Diagram("", _events(drawing), _categories(LEVELS)),

@@ -23,7 +23,7 @@ from acsard.core.messages.schema import Info, RobotState, SourceState
 from acsard.core.messages.short_texts import cause_numbers, power
 from acsard.core.messages.state_warnings import WARNING, brief, warnings
 from acsard.core.motion.gyro import STATUS_TEXTS
-from acsard.core.values import NS_PER_S
+from acsard.core.values import NS_PER_S, TWO_WHEELS
 from acsard.daemon.latencies import NAMES
 from acsard.terminal.output import table
 
@@ -142,10 +142,10 @@ def _pose(state: RobotState) -> Table:
 
 def _wheels(state: RobotState) -> Table:
     right, left, rear_left, rear_right = (*state.wheels[:4], *[math.nan] * 4)[:4]
-    rows = [
-        (axle, *(_measured(state, speed, 2, 7) for speed in speeds))
-        for axle, speeds in (("front", (left, right)), ("rear", (rear_left, rear_right)))
-    ]
+    axles = [("front", left, right), ("rear", rear_left, rear_right)]
+    if len(state.wheels) == len(TWO_WHEELS):
+        axles = [("", left, right)]
+    rows = [(axle, *(_measured(state, v, 2, 7) for v in speeds)) for axle, *speeds in axles]
     return _table(("wheels, rad/s", "left", "right"), rows, (1, 2))
 
 

@@ -235,7 +235,7 @@ def test_only_the_leg_of_a_turn_that_ended_too_early_is_repeated() -> None:
 @pytest.mark.parametrize(
     ("lies", "words"),
     [
-        ({"front": [100.0], "rear": [400.0]}, "two wheels that are 250 mm apart cannot be"),
+        ({"front": [100.0], "rear": [400.0]}, "two points that are 250 mm apart cannot be"),
         ({"wheelbase": [50.0]}, "the robot stands at"),  # which only a turned robot shows
     ],
 )

@@ -77,6 +77,7 @@ TOP = {
     ),
     "many sources": of(sources=MANY),
     "after a clear": of(sources=[replace(source, age=None) for source in STATE.sources]),
+    "two driven wheels": of(wheels=STATE.wheels[:2]),
     "without measurements": of(latencies=dict.fromkeys(STATE.latencies, UNMEASURED)),
 }
 

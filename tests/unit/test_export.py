@@ -17,7 +17,7 @@ from rosbags.highlevel import AnyReader
 from ruamel.yaml import YAML
 
 from acsard.calibration.log import read
-from acsard.core.config.settings import Config
+from acsard.core.config.settings import Config, WheelMap
 from acsard.core.ros.channels import CHANNELS
 from acsard.core.ros.names import Qos
 from acsard.core.values import NS_PER_S, REST, GyroSample, Instant, Ns
@@ -164,36 +164,51 @@ def test_an_export_that_fails_leaves_nothing_and_a_replaced_file_stays(
 
 
 GYRO = replace(Config(), odometry=replace(Config().odometry, gyro=True))
+TWO = replace(GYRO, mcu=replace(GYRO.mcu, wheels=WheelMap(left="+l", right="+r")))
+
+
+@pytest.fixture(scope="module", params=[GYRO, TWO], ids=["four wheels", "two wheels"])
+def config(request: pytest.FixtureRequest) -> Config:
+    chosen: Config = request.param
+    return chosen
 
 
 @pytest.fixture(scope="module")
-def tape() -> Tape:
-    tape, world = recorded_world(GYRO, every=BATCH)
+def tape(config: Config) -> Tape:
+    tape, world = recorded_world(config, every=BATCH)
     world.drive(0.5, 0.4, 3.0)
     return tape
 
 
-def test_calibration_reads_the_steps_up_to_the_first_gap(tape: Tape, tmp_path: Path) -> None:
-    first = tape.save(tmp_path / "first.rec.zst", GYRO, end=BATCH)
-    later = tape.save(tmp_path / "later.rec.zst", GYRO, first=2 * BATCH)
+def test_calibration_reads_the_steps_up_to_the_first_gap(
+    tape: Tape, config: Config, tmp_path: Path
+) -> None:
+    first = tape.save(tmp_path / "first.rec.zst", config, end=BATCH)
+    later = tape.save(tmp_path / "later.rec.zst", config, first=2 * BATCH)
     assert calibration_csv(Recording([first, later])) == calibration_csv(Recording([first]))
     assert calibration_csv(Recording([later])) != calibration_csv(Recording([first]))
 
 
 @pytest.fixture(scope="module")
-def turned(tape: Tape, tmp_path_factory: pytest.TempPathFactory) -> Recording:
-    return Recording([tape.save(tmp_path_factory.mktemp("drive") / "a.rec.zst", GYRO)])
+def turned(tape: Tape, config: Config, tmp_path_factory: pytest.TempPathFactory) -> Recording:
+    return Recording([tape.save(tmp_path_factory.mktemp("drive") / "a.rec.zst", config)])
 
 
 def test_the_table_has_a_row_for_each_feedback_line_and_each_gyro_sample(
-    tape: Tape, turned: Recording
+    tape: Tape, config: Config, turned: Recording
 ) -> None:
     header, *rows = table(turned)
+    wheels = ("fr", "fl", "rl", "rr") if config is GYRO else ("right", "left")
+    assert header[: len(wheels) + 2] == ("t", *wheels, "yaw_rate")
     estimates = [e for t in tape.taken for e in t.news.estimates]
     reports = [sample for t in tape.taken for sample in t.heard.gyro]
     assert {len(row) for row in rows} == {len(header)}
     assert len(estimates) == sum(row[1] != "" for row in rows) > 100
-    assert len(reports) == sum(row[5] != "" for row in rows) > 100
+    assert len(reports) == sum(row[header.index("yaw_rate")] != "" for row in rows) > 100
+    # The robot turns left: the wheels of the right side roll faster.
+    left = header.index("fl" if config is GYRO else "left")
+    faster = [row for row in rows if row[1] and float(row[1]) > float(row[left]) + 0.1]
+    assert len(faster) > 100
     assert ("driving", "up", "app") in {row[-3:] for row in rows}
 
 
@@ -210,15 +225,16 @@ def test_calibration_reads_the_same_from_the_table_and_from_the_recording(
     assert len(runs[0].t) == len(lines)
 
 
-def test_the_times_in_the_table_are_those_of_the_samples(tape: Tape) -> None:
+def test_the_times_in_the_table_are_those_of_the_samples(tape: Tape, config: Config) -> None:
     *_, estimate = [estimate for step in tape.taken for estimate in step.news.estimates]
-    wall_ns = estimate.at.wall_ns
-    cells = feedback_cells(estimate, REST)
+    wall_ns, wheels = estimate.at.wall_ns, len(config.joint_names)
+    cells = feedback_cells(estimate, REST, wheels)
     assert cells[0] == f"{wall_ns // 10**9}.{wall_ns % 10**9 // 1000:06}"
     now = Instant(START.mono_ns + 50, START.wall_ns + 50)
     arrived = GyroSample(START.mono_ns + 2_000_050, None, 0.25)
-    assert gyro_cells(arrived, now)[:6] == ("1800000000.002000", "", "", "", "", "0.25")
-    assert gyro_cells(replace(arrived, stamp_ns=1_500_000), now)[0] == "0.001500"
+    at_arrival = "1800000000.002000", *[""] * wheels, "0.25"
+    assert gyro_cells(arrived, now, wheels)[: wheels + 2] == at_arrival
+    assert gyro_cells(replace(arrived, stamp_ns=1_500_000), now, wheels)[0] == "0.001500"
 
 
 def loaded(text: str) -> Any:

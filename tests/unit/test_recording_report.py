@@ -21,7 +21,7 @@ from typing import Any
 import pytest
 from msgspec.structs import replace
 
-from acsard.core.config.settings import Config
+from acsard.core.config.settings import Config, McuConfig, WheelMap
 from acsard.core.messages.schema import RobotState, Time
 from acsard.core.ros.channels import BY_KEY, CMD_VEL_IN, LOG_CHANNEL
 from acsard.core.ros.shapes import LEVELS, Log, command_message
@@ -36,12 +36,12 @@ EVIL = '</script><script>alert(1)</script><img src=x onerror="alert(2)">\'"&lt;\
 
 
 @lru_cache
-def drive_of_two() -> tuple[Published, ...]:
+def drive_of_two(wheels: WheelMap = WheelMap()) -> tuple[Published, ...]:  # noqa: B008
     """Return the messages of a drive with two sources."""
-    tape = Tape()
-    two_drivers(World(Config(), recorder=tape))
+    tape, config = Tape(), Config(mcu=McuConfig(wheels=wheels))
+    two_drivers(World(config, recorder=tape))
     with tempfile.TemporaryDirectory() as place:
-        return tuple(published(Recording([tape.save(Path(place) / "a.rec.zst")])))
+        return tuple(published(Recording([tape.save(Path(place) / "a.rec.zst", config)])))
 
 
 def report(messages: Iterable[Published], title: str, notes: Sequence[str]) -> str:
@@ -198,16 +198,27 @@ def test_of_too_many_events_the_newest_are_shown_and_those_of_several_days_have_
         assert bool(re.search(r"<td>\d{4}-\d\d-\d\d \d\d:", text)) is dated
 
 
-def test_the_curves_are_the_messages() -> None:
-    text = report(drive_of_two(), "acsar", [])
-    sent = [item for item in drive_of_two() if item.channel.native == "cmd_vel_out"]
+@pytest.mark.parametrize(
+    ("wheels", "names"),
+    [
+        (WheelMap(), ("front right", "front left", "rear left", "rear right")),
+        (WheelMap(left="+l", right="+r"), ("right", "left")),
+    ],
+)
+def test_the_curves_are_the_messages(wheels: WheelMap, names: tuple[str, ...]) -> None:
+    drive = drive_of_two(wheels)
+    text = report(drive, "acsar", [])
+    sent = [item for item in drive if item.channel.native == "cmd_vel_out"]
     forward, turning = traces(text, "limited")
     assert forward["y"] == [round(item.message.twist.linear.x, 5) for item in sent]
     assert turning["y"] == [round(item.message.twist.angular.z, 5) for item in sent]
-    path, wheel = traces(text, "path")[0], traces(text, "front right")[0]
-    place = [item for item in drive_of_two() if item.channel.native == "odom"][-1].message
+    path = traces(text, "path")[0]
+    place = [item for item in drive if item.channel.native == "odom"][-1].message
     assert path["x"][-1] == pytest.approx(place.pose.pose.position.x, abs=1e-5)
-    assert len(wheel["y"]) > 300
+    axis = traces(text, names[0])[0]["yaxis"]
+    curves = [t for t in pictures(text)["time"]["data"] if t.get("yaxis") == axis]
+    assert tuple(curve["name"] for curve in curves) == names
+    assert all(len(curve["y"]) > 300 for curve in curves)
     received = traces(text, "lines received")[0]["y"][1:]
     assert received == pytest.approx([100.0] * len(received), abs=2)
     assert len(received) >= 3

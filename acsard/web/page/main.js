@@ -48,7 +48,7 @@ const link = new Link(refused, {
   odom: ({ value: { pose } }) => map.pose(pose.pose.position.x, pose.pose.position.y, yaw(pose.pose.orientation)),
   "sim/pose": ({ value: { pose } }) => map.truth(pose.position.x, pose.position.y),
   cmd_vel_out: commanded,
-  wheel_states: ({ value, age }) => plots.wheels.add(performance.now() - age, ...value.velocity),
+  wheel_states: ({ value, age }) => plots.rolled(performance.now() - age, value.velocity),
   diagnostics: ({ value }) => views.parts($("parts"), value),
   events: ({ value }) => views.happened($("happened"), value),
   path: ({ path }) => map.trail(path),

@@ -13,7 +13,8 @@ const ROOM = 44;
 // visible.
 const LOOKS = [[[], 0], [[12, 12], 0], [[4, 8], 0], [[5, 19], 5]];
 const COMPARED = [{ name: "measured", colour: "--accent" }, { name: "commanded", colour: "--wished" }];
-const WHEELS = ["front right", "front left", "rear left", "rear right"].map((name, n) => ({ name, colour: `--w${n}` }));
+const wheels = (...names) => names.map((name, n) => ({ name, colour: `--w${n}` }));
+const WHEELS = { 2: wheels("right", "left"), 4: wheels("front right", "front left", "rear left", "rear right") };
 const VOLTS = [{ name: "voltage", colour: "--accent" }];
 const LATE = [{ name: "99 %", colour: "--accent" }, { name: "maximum", colour: "--bad" }];
 
@@ -22,9 +23,16 @@ export class Minute {
     const plot = (name, ...rest) => new Plot($(`plot-${name}`), ...rest);
     this.speed = plot("speed", COMPARED, { low: -0.1, high: 0.3 });
     this.turn = plot("turn", COMPARED, { low: -0.3, high: 0.3 });
-    this.wheels = plot("wheels", WHEELS, { low: -1, high: 3 });
+    this.wheels = plot("wheels", [], { low: -1, high: 3 }); // its lines come with the first values
     this.late = plot("late", LATE, { low: 0, high: 1 });
     this.volts = plot("volts", VOLTS, { span: 1 });
+  }
+
+  /** Add the speeds of four wheels or two, measured at `now`, ms. */
+  rolled(now, speeds) {
+    if (!(speeds.length in WHEELS)) return;
+    this.wheels.of(WHEELS[speeds.length]);
+    this.wheels.add(now, ...speeds);
   }
 
   draw(now) {
@@ -50,16 +58,25 @@ class Plot {
   #canvas;
   #lines;
   #floor;
+  #names;
+  #legend = made("p", "legend");
 
   /** `lines` has an entry {name, colour} for each value of `add`. `floor` is the smallest range of the scale, {low,
    *  high}, or for values that are far from zero its smallest span around the values, {span}. */
   constructor(canvas, lines, floor) {
     this.#canvas = canvas;
-    this.#lines = lines.map((line) => ({ ...line, points: [], sample: made("canvas"), said: made("span") }));
     this.#floor = floor;
-    const legend = this.#lines.map((line) => made("span", "", line.sample, line.said));
+    canvas.after(this.#legend);
+    this.of(lines);
+  }
+
+  /** Draw these lines from now on, if they are others. */
+  of(lines) {
+    if (lines === this.#names) return;
+    this.#names = lines;
+    this.#lines = lines.map((line) => ({ ...line, points: [], sample: made("canvas"), said: made("span") }));
     for (const { sample } of this.#lines) sample.setAttribute("aria-hidden", "true");
-    canvas.after(made("p", "legend", ...legend));
+    this.#legend.replaceChildren(...this.#lines.map((line) => made("span", "", line.sample, line.said)));
   }
 
   /** Add one value per line at `now`, ms; null adds nothing to its line. */
