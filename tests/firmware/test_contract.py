@@ -5,6 +5,7 @@ The machine code runs in a simulator, and the times are those of the board. All 
 
 from __future__ import annotations
 
+import re
 import statistics
 from collections.abc import Iterator
 from pathlib import Path
@@ -205,6 +206,28 @@ def test_a_pressed_emergency_stop_is_off_reported_and_kept_until_zeros(
         assert not drives()
         host.send(STOP)
         assert drives()
+
+
+def test_the_sketch_for_two_motors_obeys_and_sends_two_values(
+    runner: Path, core: Path, tmp_path: Path
+) -> None:
+    two = build_sketch(core, tmp_path, ("MOTORS = 4", "MOTORS = 2"))
+    with Board(runner, two, "--free-speed", FREE_SPEEDS) as board, Host(board) as host:
+        for line in (STOP, speeds_line(DRIVE), b"ap10.00,bn05.00"):
+            host.send(line)
+        board.stays_off(50)  # neither four zeros nor speeds before two zeros
+        host.lines()
+        host.send(b"ap00.00,bp00.00")
+        for _ in range(100):
+            host.send(b"ap10.00,bn05.00")
+            *_, reply = host.lines(10)
+        assert re.fullmatch(rb"ap(09\.\d\d|10\.\d\d),bn(04\.9\d|05\.\d\d)", reply), reply
+        speeds = [motor.speed for motor in board.status().motors]
+        assert speeds == pytest.approx([10.0, -5.0, 0.0, 0.0], rel=0.02)
+        for _ in range(40):
+            host.send(speeds_line(DRIVE))
+            host.board.passes(10)
+        assert board.status().is_off, "four values do not feed the watchdog"
 
 
 @pytest.mark.nightly

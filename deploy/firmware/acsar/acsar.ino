@@ -3,6 +3,7 @@
 #include <avr/wdt.h>
 
 const long BAUD_RATE = 115200;     // mcu.baud_rate in acsard.toml
+const byte MOTORS = 4;             // 2: only a and b are there
 const int COUNTS_PER_TURN = 3200;  // encoder edges per turn of the wheel: pulses x 4 x gear ratio
 const float FREE_SPEED = 50;       // speed of a lifted wheel at full voltage, rad/s
 const float KP = 0.3, KI = 6;      // gain and gain per second of the speed control; lower them if a wheel jerks
@@ -10,10 +11,10 @@ const int ESTOP = -1;              // 37 if a second, normally-closed contact of
 const byte PWM[] = {5, 6, 7, 8}, FORWARD[] = {22, 24, 26, 28}, REVERSE[] = {23, 25, 27, 29};  // motors a to d
 const byte TICK_MS = 10;
 
-struct Sample { unsigned counts[4]; unsigned long us; };
+struct Sample { unsigned counts[MOTORS]; unsigned long us; };
 volatile unsigned counts[4];       // encoder a at A8 and A9, b at A10 and A11, c at A12 and A13, d at A14 and A15
 volatile byte levels;
-float wanted[4];                   // rad/s
+float wanted[MOTORS];              // rad/s
 bool armed;                        // a line of zeros has come since the boot or the emergency stop
 unsigned long fed_ms;              // when the last valid line came
 
@@ -25,23 +26,23 @@ ISR(PCINT2_vect) {
     if (moved & 3) counts[i] += STEP[(was & 3) << 2 | (now & 3)];
 }
 
-void measure(Sample &last, float speeds[4]) {  // the mean speeds since the last sample
+void measure(Sample &last, float speeds[MOTORS]) {  // the mean speeds since the last sample
   Sample now;
   noInterrupts();
-  for (byte i = 0; i < 4; i++) now.counts[i] = counts[i];
+  for (byte i = 0; i < MOTORS; i++) now.counts[i] = counts[i];
   now.us = micros();
   interrupts();
   float rate = 1e6 * TWO_PI / COUNTS_PER_TURN / (now.us - last.us);
-  for (byte i = 0; i < 4; i++) speeds[i] = (int)(now.counts[i] - last.counts[i]) * rate;
+  for (byte i = 0; i < MOTORS; i++) speeds[i] = (int)(now.counts[i] - last.counts[i]) * rate;
   last = now;
 }
 
 void control() {  // a command of zero is no voltage: so not even a reversed encoder lets the wheel run away then
   static Sample last;
-  static float integral[4], speeds[4];
-  static int8_t before[4];
+  static float integral[MOTORS], speeds[MOTORS];
+  static int8_t before[MOTORS];
   measure(last, speeds);
-  for (byte i = 0; i < 4; i++) {
+  for (byte i = 0; i < MOTORS; i++) {
     float error = (wanted[i] - speeds[i]) / FREE_SPEED;
     integral[i] = wanted[i] ? constrain(integral[i] + KI * TICK_MS / 1000 * error, -1.0f, 1.0f) : 0;
     int pwm = wanted[i] ? constrain(255 * (wanted[i] / FREE_SPEED + KP * error + integral[i]), -255, 255) : 0;
@@ -58,20 +59,20 @@ void identify() { Serial.print(F("!acsard-mcu sketch watchdog_ms=300 counts=")),
 
 void reply() {
   static Sample last;
-  float speeds[4];
-  char text[34];
-  if (Serial.availableForWrite() < 33) return;  // left out if the wire is too slow for it, but never cut
+  float speeds[MOTORS];
+  char text[8 * MOTORS + 2];
+  if (Serial.availableForWrite() < 8 * MOTORS + 1) return;  // left out if the wire is too slow for it, but never cut
   measure(last, speeds);
-  for (byte i = 0; i < 4; i++) {
+  for (byte i = 0; i < MOTORS; i++) {
     int size = min(lround(fabs(speeds[i]) * 100), 9999);
     sprintf(text + 8 * i, "%c%c%02d.%02d,", 'a' + i, size && speeds[i] < 0 ? 'n' : 'p', size / 100, size % 100);
   }
-  text[31] = '\0';
+  text[8 * MOTORS - 1] = '\0';
   Serial.println(text);
 }
 
-bool decode(const char *line, byte length, float speeds[4]) {  // `ap12.50,bn08.75,cp15.00,dn10.25`, perhaps a comma
-  if (length != 31 && length != 32) return false;
+bool decode(const char *line, byte length, float speeds[MOTORS]) {  // `ap12.50,bn08.75,cp15.00,dn10.25`, perhaps a comma
+  if (length != 8 * MOTORS - 1 && length != 8 * MOTORS) return false;
   for (byte i = 0; i < length; i++) {
     char c = line[i], k = i % 8;
     if (!(k == 0 ? c == 'a' + i / 8 : k == 1 ? c == 'p' || c == 'n' : k == 4 ? c == '.' : k == 7 ? c == ',' : isDigit(c)))
@@ -82,10 +83,11 @@ bool decode(const char *line, byte length, float speeds[4]) {  // `ap12.50,bn08.
 }
 
 void obey(const char *line, byte length) {  // a whole valid line, or nothing
-  float speeds[4];
+  float speeds[MOTORS];
+  bool zeros = true;
   if (length == 1 && line[0] == '?') return identify();
   if (!decode(line, length, speeds)) return;
-  bool zeros = !speeds[0] && !speeds[1] && !speeds[2] && !speeds[3];
+  for (byte i = 0; i < MOTORS; i++) zeros = zeros && !speeds[i];
   if (zeros && (ESTOP < 0 || !digitalRead(ESTOP))) armed = true;
   if (!armed && !zeros) return ESTOP < 0 ? identify() : reply();
   memcpy(wanted, speeds, sizeof wanted);
