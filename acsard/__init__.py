@@ -1,4 +1,4 @@
-"""acsard: the hardware interface daemon of a four-wheel differential-drive robot.
+"""acsard: the hardware interface daemon of a differential-drive robot.
 
 One process, the daemon, drives the robot with one asyncio event loop. The daemon exchanges lines
 with a microcontroller on a serial port, and messages with clients on a Zenoh bus. It runs a control

@@ -34,7 +34,7 @@ def actions(of: argparse.ArgumentParser) -> Iterator[argparse.Action]:
 def main(directory: Path) -> None:
     directory.mkdir(parents=True, exist_ok=True)
     about = {"project_name": "acsard", "version": version(), "manual_title": "ACSAR robot"}
-    about["description"] = "daemon and tools of a four-wheel robot"
+    about["description"] = "daemon and tools of a differential-drive robot"
     (directory / "acsard.1").write_text(f"{Manpage(parser(), about)}\n", encoding="utf-8")
     whole = parser()
     for action in actions(whole):

@@ -6,13 +6,14 @@ The tests do not need ROS. They do not show that ROS itself accepts the files.
 from __future__ import annotations
 
 import json
-import math
 import re
 import runpy
+import shutil
+import subprocess
 import sys
 import xml.etree.ElementTree as ET
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 from unittest.mock import MagicMock
 
 import msgspec
@@ -21,13 +22,12 @@ import zenoh
 from msgspec.structs import replace
 from ruamel.yaml import YAML
 
-from acsard.core.config.settings import DIAGNOSTICS_HZ, BusConfig, Config, RosConfig
+from acsard.core.config.settings import DIAGNOSTICS_HZ, BusConfig, Config, RosConfig, WheelMap
 from acsard.core.messages.diagnostics import diagnostics
 from acsard.core.motion.neutral import NEUTRAL_PAUSE_NS
 from acsard.core.ros.transports import ros_names
 from acsard.core.values import NS_PER_S, Recording
 from tests import promised
-from tests.each import each
 from tests.unit.examples import OUTPUTS, SNAPSHOT, changed
 
 FILES = Path(__file__).parents[1] / "deploy" / "ros2"
@@ -44,12 +44,41 @@ WHEEL_SIGNS = {  # x and y of each wheel's position
     CONFIG.joints.front_left: (1, 1),
     CONFIG.joints.rear_left: (-1, 1),
     CONFIG.joints.rear_right: (-1, -1),
+    CONFIG.joints.left: (0, 1),
+    CONFIG.joints.right: (0, -1),
 }
 TIMEOUTS = {source.timeout for source in CONFIG.commands.sources}
 
 
-def urdf() -> ET.Element:
-    return ET.parse(FILES / "acsar.urdf").getroot()
+class Described(NamedTuple):
+    """A robot, and the directory of the files that describe it."""
+
+    config: Config
+    files: Path
+
+    def urdf(self) -> ET.Element:
+        return ET.parse(self.files / "acsar.urdf").getroot()
+
+    def joint(self, name: str) -> ET.Element:
+        return find_only(self.urdf(), f"joint[@name='{name}']")
+
+    def joint_to(self, link: str) -> ET.Element:
+        joints = self.urdf().findall("joint")
+        return next(j for j in joints if find_only(j, "child").get("link") == link)
+
+
+@pytest.fixture(scope="module", params=["four wheels", "two wheels"])
+def robot(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Described:
+    """Return a robot with four driven wheels, or with two after the command of the manual."""
+    if request.param == "four wheels":
+        return Described(CONFIG, FILES)
+    wheels = WheelMap(left="+l", right="+r")
+    files = tmp_path_factory.mktemp("two")
+    for name in ("acsar.urdf", "controllers.yaml"):
+        shutil.copy(FILES / name, files)
+    (command,) = re.findall(r"^sed .+$", manual("howto/two-wheels"), re.M)
+    subprocess.run(["sh", "-c", command], cwd=files, check=True, timeout=20)
+    return Described(replace(CONFIG, mcu=replace(CONFIG.mcu, wheels=wheels)), files)
 
 
 def find_only(element: ET.Element, path: str) -> ET.Element:
@@ -62,20 +91,12 @@ def numbers(text: str | None) -> list[float]:
     return [float(number) for number in (text or "").split()]
 
 
-def joint(name: str) -> ET.Element:
-    return find_only(urdf(), f"joint[@name='{name}']")
+def yaml(name: str, files: Path = FILES) -> Any:
+    return YAML(typ="safe").load((files / name).read_text())
 
 
-def joint_to(link: str) -> ET.Element:
-    return next(j for j in urdf().findall("joint") if find_only(j, "child").get("link") == link)
-
-
-def yaml(name: str) -> Any:
-    return YAML(typ="safe").load((FILES / name).read_text())
-
-
-def ros_parameters(name: str, node: str) -> dict[str, Any]:
-    parameters: dict[str, Any] = yaml(name)[node]["ros__parameters"]
+def ros_parameters(name: str, node: str, files: Path = FILES) -> dict[str, Any]:
+    parameters: dict[str, Any] = yaml(name, files)[node]["ros__parameters"]
     return parameters
 
 
@@ -94,33 +115,43 @@ def published_names(direction: str) -> set[str]:
 # acsar.urdf
 
 
-@each("name", CONFIG.joint_names)
-def test_each_wheel_touches_the_floor_at_half_the_wheel_separation(name: str) -> None:
+def test_each_wheel_touches_the_floor_at_half_the_wheel_separation(robot: Described) -> None:
     radius, half = CONFIG.drive.wheel_radius, CONFIG.drive.wheel_separation / 2
-    assert find_only(joint(name), "parent").get("link") == CONFIG.odometry.base_frame
-    x, y, z = numbers(find_only(joint(name), "origin").get("xyz"))
-    assert (y, z) == pytest.approx((WHEEL_SIGNS[name][1] * half, radius))
-    assert math.copysign(1, x) == WHEEL_SIGNS[name][0]
-    assert numbers(find_only(joint(name), "axis").get("xyz")) == [0, 1, 0]
-    limit = find_only(joint(name), "limit").get("velocity")
-    assert numbers(limit) == [CONFIG.limits.wheel_speed]
+    wheels = [j.get("name") for j in robot.urdf().findall("joint[@type='continuous']")]
+    assert tuple(wheels) == robot.config.joint_names
+    for name in robot.config.joint_names:
+        joint = robot.joint(name)
+        assert find_only(joint, "parent").get("link") == CONFIG.odometry.base_frame
+        x, y, z = numbers(find_only(joint, "origin").get("xyz"))
+        assert (y, z) == pytest.approx((WHEEL_SIGNS[name][1] * half, radius))
+        assert (x > 0) - (x < 0) == WHEEL_SIGNS[name][0]
+        assert numbers(find_only(joint, "axis").get("xyz")) == [0, 1, 0]
+        limit = find_only(joint, "limit").get("velocity")
+        assert numbers(limit) == [CONFIG.limits.wheel_speed]
 
 
-def test_lidar_and_footprint_frames_agree_with_the_configuration() -> None:
+def test_each_link_has_a_joint_to_it_and_none_is_left_over(robot: Described) -> None:
+    links = {link.get("name") for link in robot.urdf().findall("link")}
+    joints = robot.urdf().findall("joint")
+    children = [find_only(joint, "child").get("link") for joint in joints]
+    assert sorted([*map(str, children), CONFIG.odometry.base_frame]) == sorted(map(str, links))
+
+
+def test_lidar_and_footprint_frames_agree_with_the_configuration(robot: Described) -> None:
     lidar = CONFIG.lidar
     for link, xyz, rpy in (
         (lidar.lidar_frame, [lidar.lidar_x_offset, lidar.lidar_y_offset, 0],
          [0, 0, lidar.lidar_yaw]),
         ("base_footprint", [0, 0, 0], [0, 0, 0]),
     ):  # fmt: skip
-        fixed_joint = joint_to(link)
+        fixed_joint = robot.joint_to(link)
         assert find_only(fixed_joint, "parent").get("link") == CONFIG.odometry.base_frame
         assert numbers(find_only(fixed_joint, "origin").get("xyz")) == xyz
         assert numbers(find_only(fixed_joint, "origin").get("rpy")) == rpy
 
 
-def test_ros2_control_has_what_the_topic_hardware_needs() -> None:
-    control = find_only(urdf(), "ros2_control")
+def test_ros2_control_has_what_the_topic_hardware_needs(robot: Described) -> None:
+    control = find_only(robot.urdf(), "ros2_control")
     assert control.get("type") == "system"
     plugin = find_only(control, "hardware/plugin").text
     assert plugin == "joint_state_topic_hardware_interface/JointStateTopicSystem"
@@ -128,7 +159,7 @@ def test_ros2_control_has_what_the_topic_hardware_needs() -> None:
     assert parameters["joint_commands_topic"] == "/joint_commands"
     assert parameters["joint_states_topic"] == "/joint_states"
     assert parameters["trigger_joint_command_threshold"] == "-1"
-    assert tuple(j.get("name") for j in control.findall("joint")) == CONFIG.joint_names
+    assert tuple(j.get("name") for j in control.findall("joint")) == robot.config.joint_names
     for wheel in control.findall("joint"):
         assert [c.get("name") for c in wheel.findall("command_interface")] == ["velocity"]
         states = [s.get("name") for s in wheel.findall("state_interface")]
@@ -138,12 +169,12 @@ def test_ros2_control_has_what_the_topic_hardware_needs() -> None:
 # controllers.yaml
 
 
-def test_the_controller_has_the_dimensions_and_limits_of_the_robot() -> None:
-    parameters = ros_parameters("controllers.yaml", "/**/diff_drive_controller")
-    joints, drive, limits = CONFIG.joints, CONFIG.drive, CONFIG.limits
+def test_the_controller_has_the_dimensions_and_limits_of_the_robot(robot: Described) -> None:
+    parameters = ros_parameters("controllers.yaml", "/**/diff_drive_controller", robot.files)
+    names, drive, limits = robot.config.joint_names, CONFIG.drive, CONFIG.limits
     wanted = {
-        "left_wheel_names": [joints.front_left, joints.rear_left],
-        "right_wheel_names": [joints.front_right, joints.rear_right],
+        "left_wheel_names": [name for name in names if "left" in name],
+        "right_wheel_names": [name for name in names if "right" in name],
         "wheel_separation": drive.wheel_separation,
         "wheel_radius": drive.wheel_radius,
         "wheel_separation_multiplier": drive.wheel_separation_multiplier,

@@ -122,9 +122,9 @@ def parser(
     """
     whole = _Parser(
         prog="acsard",
-        description="The hardware interface of a four-wheel differential-drive robot. It connects "
-        "the robot's microcontroller (serial port) to a Zenoh bus. Without a subcommand, acsard "
-        "runs the daemon.",
+        description="The hardware interface of a differential-drive robot with two or four driven "
+        "wheels. It connects the robot's microcontroller (serial port) to a Zenoh bus. Without a "
+        "subcommand, acsard runs the daemon.",
         epilog=_EPILOG,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )

@@ -212,7 +212,8 @@ wheels_swapped
     -> check whether their motors or encoders are swapped, or reversed
 wheel_blocked
     {wheel} wheel is blocked, or has no power:
-    -> check cable, motor and encoder, and for motor d also the setting mcu.trailing_comma
+    -> check cable, motor and encoder, and for the last motor of a line also the setting
+    mcu.trailing_comma
 wheel_slow
     {wheel} wheel reaches {share} of its expected speed:
     -> check the load, the battery, limits.wheel_speed and feedback.response_time
@@ -221,7 +222,7 @@ wheel_fast
     -> check the speed controller of the board and feedback.response_time
 guard_line_damaged
     the daemon's guard replaced a line for the board with zeros: the line is not complete, or does
-    not have four wheel speeds
+    not have the speed of each wheel
 guard_too_fast
     the daemon's guard replaced a line for the board with zeros: the line moves a wheel faster than
     limits.wheel_speed
