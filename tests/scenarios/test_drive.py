@@ -72,13 +72,22 @@ def test_silence_begins_a_ramp_within_the_timeout_and_a_tick(world: World) -> No
     assert world.lines()[-1] == b"ap00.00,bp00.00,cp00.00,dp00.00\r\n"
 
 
-def test_wheels_can_be_commanded_by_name_in_any_order(world: World) -> None:
+@pytest.mark.parametrize(
+    ("wheels", "line"),
+    [
+        (WheelMap(), b"ap10.00,bp05.00,cp05.00,dp10.00\r\n"),
+        (WheelMap(left="+l", right="+r"), b"lp05.00,rp10.00\r\n"),
+    ],
+)
+def test_wheels_can_be_commanded_by_name_in_any_order(wheels: WheelMap, line: bytes) -> None:
+    world = World(Config(mcu=McuConfig(wheels=wheels)))
     names = list(reversed(world.config.joint_names))
     for speed in (*[0.0] * 24, *[10.0] * 40):
-        payload = msgspec.msgpack.encode({"name": names, "velocity": [speed] * 4})
+        speeds = [speed if "right" in name else speed / 2 for name in names]
+        payload = msgspec.msgpack.encode({"name": names, "velocity": speeds})
         world.put("wheel_cmd/ros2_control", payload)
         world.run(0.05)
-    assert world.lines()[-1] == b"ap10.00,bp10.00,cp10.00,dp10.00\r\n"
+    assert world.lines()[-1] == line
     assert world.state.source == "ros2_control"
 
 

@@ -128,8 +128,9 @@ def common_robot(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Robot]:
 
 
 @pytest.fixture
-def own_robot(tmp_path: Path) -> Iterator[Robot]:
-    with running(tmp_path) as robot:
+def own_robot(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Robot]:
+    """Run a new robot. A test may choose its configuration as the parameter of this fixture."""
+    with running(tmp_path, getattr(request, "param", None)) as robot:
         yield robot
 
 

@@ -271,6 +271,10 @@ def finish(
 Tables = Mapping[str, Mapping[str, object]]
 
 
+TWO_WHEELS: Tables = {"mcu.wheels": {"left": "+l", "right": "+r"}}
+"""Configuration of a robot with two driven wheels."""
+
+
 def write_config(path: Path, tables: Tables) -> Path:
     """Write a TOML file. Its values are written as JSON, which is the same for these types."""
     lines = []

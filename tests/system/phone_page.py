@@ -12,7 +12,7 @@ import pytest
 from tests.system import harness
 from tests.system.browser import Page
 from tests.system.chromium import Browser
-from tests.system.harness import Bus, Daemon, until
+from tests.system.harness import Bus, Daemon, Tables, until
 
 HELD = "document.getElementById('stick').matches('.held')"
 
@@ -54,7 +54,7 @@ class Robot(NamedTuple):
 
 
 @contextmanager
-def running(where: Path) -> Iterator[Robot]:
+def running(where: Path, config: Tables | None = None) -> Iterator[Robot]:
     """Run a robot and its page."""
-    with harness.running(where) as (daemon, bus), Page(daemon, where) as server:
+    with harness.running(where, config=config) as (daemon, bus), Page(daemon, where) as server:
         yield Robot(daemon, bus, server)

@@ -13,13 +13,17 @@ from pathlib import Path
 import pytest
 
 from acsard.client import connect
+from acsard.core.values import TWO_WHEELS as TWO
+from acsard.core.values import WHEELS
 from acsard.host.errors import Exit
 from tests.system.bystander import lost
 from tests.system.harness import (
+    TWO_WHEELS,
     Bus,
     Daemon,
     Finished,
     Program,
+    Tables,
     acsard,
     environment,
     finish,
@@ -139,13 +143,34 @@ def test_a_simulator_does_not_remove_the_link_of_the_one_that_replaced_it(tmp_pa
     assert not link.is_symlink()
 
 
+JOINTS = [f"{wheel}_wheel_joint" for wheel in (*WHEELS, *TWO)]
+
+
 @pytest.mark.slow
-def test_move_drives_the_ways_one_after_the_other_and_prints_the_pose(
-    shared: Daemon, bus: Bus
+@pytest.mark.parametrize(("wheels", "joints"), [({}, JOINTS[:4]), (TWO_WHEELS, JOINTS[4:])])
+def test_a_robot_moves_as_told_and_its_recording_replays_and_has_each_of_its_wheels(
+    wheels: Tables, joints: list[str], tmp_path: Path
 ) -> None:
-    bus.at_rest()
-    bus.get("srv/reset_odometry")
-    ended = tool(shared, "move", "forward", "0.1", "left", "20", "back", "0")
-    assert ended.code == 0, ended
-    assert re.fullmatch(r"x +\+0\.(09|10)\d m  y +[+-]0\.00\d m  yaw +\+(19|20)\.\d°", ended.out)
-    assert bus.state()["yaw"] == pytest.approx(math.radians(20), abs=math.radians(1.0))
+    place = tmp_path / "recorded"
+    tables = {**wheels, "record": {"directory": str(place)}}
+    with running(tmp_path, config=tables) as (daemon, bus):
+        ended = tool(daemon, "move", "forward", "0.3", "left", "90", "--angular", "2")
+        assert ended.code == 0, ended
+        assert re.fullmatch(r"x +\+0\.30\d m  y +[+-]0\.00\d m  yaw +\+(89|90)\.\d°", ended.out)
+        true = bus.get("sim/pose")["pose"]
+        turned = 2 * math.atan2(true["orientation"]["z"], true["orientation"]["w"])
+        where = true["position"]["x"], true["position"]["y"]
+        print(f"off by {1000 * math.dist(where, (0.3, 0)):.2f} mm, {math.degrees(turned) - 90:.3f}")
+        assert where == pytest.approx((0.3, 0.0), abs=0.002)
+        assert math.degrees(turned) == pytest.approx(90.0, abs=0.3)
+        states = bus.get("wheel_states")
+        assert (states["name"], len(states["velocity"])) == (joints, len(joints))
+        daemon.signal(signal.SIGINT)
+        assert daemon.ended(5.0) == 0
+    (file,) = map(str, place.iterdir())
+    replay = typed("recording", "replay", file)
+    assert replay.code == 0, replay
+    table = str(tmp_path / "drive.csv")
+    assert typed("recording", "export", "--csv", file, table).code == 0
+    header = Path(table).read_text().partition(",yaw_rate,")[0]
+    assert header == ("t,fr,fl,rl,rr" if len(joints) == 4 else "t,right,left")

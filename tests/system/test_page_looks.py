@@ -17,7 +17,7 @@ import pytest
 
 from tests.system.browser import Page
 from tests.system.chromium import CHROMIUM, DESKTOP, PHONE, SIDEWAYS, Browser
-from tests.system.harness import Bus, Daemon, Peer, until
+from tests.system.harness import TWO_WHEELS, Bus, Daemon, Peer, until
 from tests.system.phone_page import Phone, alone
 from tests.tools import pictures
 from tests.tools.pictures import VIEWS
@@ -247,16 +247,29 @@ SEEN = """(() => {
 })()"""
 
 
-@alone
 @pytest.mark.nightly
-def test_curves_that_overlap_are_distinguishable_and_show_their_values(phone: Phone) -> None:
+@pytest.mark.parametrize(
+    ("own_robot", "names"),
+    [
+        (None, ["front right", "front left", "rear left", "rear right"]),
+        (TWO_WHEELS, ["right", "left"]),
+    ],
+    indirect=["own_robot"],
+)
+@alone
+def test_curves_that_overlap_are_distinguishable_and_show_their_values(
+    phone: Phone, names: list[str]
+) -> None:
     browser = phone.browser
     browser.size(*DESKTOP, touch=False)
     browser.tap("tab-status")
     rows = "[...document.querySelectorAll('#plot-wheels + .legend > span')]"
     legend = f"{rows}.map(one => one.textContent)"
-    values = r"^(front right|front left|rear left|rear right) .?\d+\.\d\d$"
-    until(lambda: all(re.match(values, label) for label in browser.js(legend)), 10.0, "values")
-    assert len(browser.js(legend)) == 4
-    # At rest all four are zero: each has its colour somewhere on the line.
-    until(lambda: browser.js(SEEN) == 4, 20.0, "four colours")
+
+    def named() -> list[str]:
+        values = [re.fullmatch(r"(.+) .?\d+\.\d\d", label) for label in browser.js(legend)]
+        return [value[1] for value in values if value]
+
+    until(lambda: named() == names, 10.0, "values")
+    # At rest all are zero: each has its colour somewhere on the line.
+    until(lambda: browser.js(SEEN) == len(names), 20.0, "a colour for each wheel")
