@@ -26,7 +26,7 @@ from msgspec import Struct
 from acsard.core.formatting import lasting, many, printable
 from acsard.core.messages.schema import JointState, Odometry, RobotState, TwistStamped
 from acsard.core.ros.shapes import LEVELS, Log
-from acsard.core.values import NS_PER_S, wheel_names
+from acsard.core.values import NS_PER_S, WHEELS, wheel_names, wheels4
 from acsard.recording.published import Published
 
 # The file of the npm package plotly.js-basic-dist-min 4.1.1, which draws curves and bars.
@@ -147,6 +147,7 @@ class Drawing:
 
     def __init__(self, messages: Iterable[Published]) -> None:
         self.path, self.wheels, self.counters = Rows(), Rows(), Rows(3 * COUNTED_S)
+        self.wheel_names: tuple[str, ...] = WHEELS  # of the last message
         self.speeds: dict[str, Rows] = defaultdict(Rows)  # m/s and rad/s, by the name of the curve
         self.bands: dict[str, list[Span]] = defaultdict(list)
         self.events: deque[tuple[float, Log, Row | None]] = deque(maxlen=MAX_EVENTS)
@@ -164,7 +165,8 @@ class Drawing:
             case Odometry():
                 self._odometry(t, message)
             case JointState():
-                self.wheels.add(t, *message.velocity)
+                self.wheels.add(t, *wheels4(message.velocity))
+                self.wheel_names = wheel_names(len(message.velocity))
             case TwistStamped(twist=twist):
                 name = f"commanded by {item.source}" if item.source else "limited"
                 self.speeds[name].add(t, twist.linear.x, twist.angular.z)
@@ -361,12 +363,11 @@ def _columns(rows: Iterable[Row]) -> list[tuple[float, ...]]:
 
 def _diagrams(drawing: Drawing) -> Figure:
     bands = {name: spans for name, spans in drawing.bands.items() if any(s.kind for s in spans)}
-    wheels = wheel_names(len(drawing.wheels.last or ()) - 1)
     return _stacked(
         [
             Diagram("forward, m/s", _speeds(drawing, 1), _range(drawing, 1)),
             Diagram("turning, rad/s", _speeds(drawing, 2), _range(drawing, 2)),
-            Diagram("wheels, rad/s", _over_time(drawing.wheels, wheels), {}),
+            Diagram("wheels, rad/s", _over_time(drawing.wheels, drawing.wheel_names), {}),
             Diagram("per second", _over_time(drawing.counters, COUNTERS), {}),
             Diagram("", _bars(bands), _categories(bands)),
             Diagram("", _events(drawing), _categories(LEVELS)),

@@ -224,6 +224,14 @@ def test_the_curves_are_the_messages(wheels: WheelMap, names: tuple[str, ...]) -
     assert len(received) >= 3
 
 
+def test_a_robot_that_got_other_wheels_has_the_curves_of_the_last_ones() -> None:
+    messages = drive_of_two() + drive_of_two(WheelMap(left="+l", right="+r"))
+    text = report(messages, "acsar", [])
+    right, left = traces(text, "right")[0], traces(text, "left")[0]
+    assert len(right["y"]) == len(left["y"]) > 600
+    assert not traces(text, "front right")
+
+
 def test_the_bands_say_who_drives_and_why_another_waits() -> None:
     text = report(drive_of_two(), "acsar", [])
     (drives,), (waits,) = traces(text, "drives"), traces(text, "waits")
