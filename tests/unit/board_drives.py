@@ -11,12 +11,13 @@ import bisect
 import math
 from collections import deque
 from collections.abc import Iterator
+from statistics import fmean
 from typing import Literal
 
 import numpy as np
 from msgspec import Struct
 
-from acsard.core.config.settings import McuConfig
+from acsard.core.config.settings import McuConfig, WheelMap
 from acsard.core.link.feedback import Line
 from acsard.core.link.link_output import QUESTION_LINE, Output
 from acsard.core.link.link_setup import LinkSetup
@@ -59,6 +60,7 @@ class Case(Struct, frozen=True):
     lost: float = 0.0
     counts: int = 0
     checked: bool = False
+    wheels: WheelMap = WheelMap()
 
 
 def _path(rng: np.random.Generator, seconds: float) -> tuple[np.ndarray, np.ndarray]:
@@ -103,13 +105,16 @@ class Host:
             reply_period=0.0 if case.prompted else PERIOD,
             encoder_counts=case.counts,
             link_check="on" if case.checked else "off",
+            wheels=case.wheels,
         )
         self.setup, self.session, self.out = LinkSetup.of(mcu, RATE), McuSession(), Output()
-        self.found, self.counted = Odometer(counts=case.counts), Pose()
+        self.found = Odometer(counts=case.counts, wheels=case.wheels)
+        self.counted = Pose()
         self.made: list[float] = []
         self.heard: list[Line] = []
         self.now = self._reported = 0.0  # times of the last step, and of the last new speeds
-        self._wheels, self._speeds = self._turned(0.0), WheelSpeeds()
+        self._wheels = self._turned(0.0)
+        self._speeds = (0.0,) * len(self._wheels)
         starts = np.arange(case.stall_every * 0.7, seconds - 1.0, case.stall_every)
         starts += rng.uniform(0, case.stall_every * 0.1, len(starts))
         self._stalls: list[float] = starts.tolist() if case.stall else []
@@ -126,37 +131,41 @@ class Host:
         if at - self._reported >= LEAST_WINDOW:
             then, now = self._wheels, self._turned(at)
             dt = at - self._reported if nominal is None else nominal
-            a, b, c, d = (after - before for after, before in zip(now, then, strict=True))
+            angles = [after - before for after, before in zip(now, then, strict=True)]
             self._wheels, self._reported = now, at
-            self._speeds = WheelSpeeds(*(round(angle / dt, 2) for angle in (a, b, c, d)))
-            left, right = (b + c) / 2 * 0.05, (a + d) / 2 * 0.05
+            self._speeds = tuple([round(angle / dt, 2) for angle in angles])
+            right, left = fmean(angles[0::3]) * 0.05, fmean(angles[1:3]) * 0.05
             self.counted = arc(self.counted, (right + left) / 2, (right - left) / 0.30)
         data = ", ".join(
             f"{letter}{'n' if speed < 0 else 'p'}{abs(speed):05.2f}"
-            for letter, speed in zip("abcd", self._speeds.as_tuple(), strict=True)
+            for letter, speed in self._by_letter(self._speeds)
         ).encode()
         if b"#" in command:
             data += b"#" + command[command.index(b"#") + 1 :][:2]
             if counts := self.case.counts:
-                turns = [round(angle * counts / math.tau) for angle in self._wheels]
+                turns = [round(a * counts / math.tau) for _, a in self._by_letter(self._wheels)]
                 fields = [int(self._reported * 1000), *turns]
                 data += b"@" + b"".join(b"%04X" % (field % 65536) for field in fields)
             data += b"*%04X" % binascii.crc_hqx(data, 0)
         return data + b"\r\n"
 
+    def _by_letter(self, wheels: tuple[float, ...]) -> list[tuple[str, float]]:
+        motors = [motor[1] for motor in self.case.wheels.motors]
+        return sorted(zip(motors, wheels, strict=True))
+
     def _turned(self, at: float) -> tuple[float, ...]:
-        """Return the angles of the wheels a to d by their encoders, rad."""
+        """Return the angles of the wheels by their encoders, rad, in the order of their names."""
         i = int(at / GRID)
         share = at / GRID - i
         left, right = (
             float(side[i] + (side[i + 1] - side[i]) * share) for side in (self.left, self.right)
         )
-        wheels = right, left, left, right
+        wheels = (right, left, left, right)[: len(self.case.wheels.names)]
         if not self.case.counts:
             return wheels
         step = math.tau / self.case.counts
         # The edges of the encoders are not at the same angles.
-        edges = zip(wheels, (0.0, 0.6, 0.1, 0.4), strict=True)
+        edges = zip(wheels, (0.0, 0.6, 0.1, 0.4), strict=False)
         return tuple(math.floor(angle / step + edge) * step for angle, edge in edges)
 
     # the path to the host

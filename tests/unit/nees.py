@@ -18,10 +18,11 @@ import numpy as np
 from msgspec import Struct
 from numpy.typing import NDArray
 
-from acsard.core.config.settings import OdometryConfig
+from acsard.core.config.settings import OdometryConfig, WheelMap
 from acsard.core.link.feedback import Line
 from acsard.core.values import Instant, WheelSpeeds
 from tests.unit.odometer import Odometer
+from tests.wheels import FOUR
 
 Array = NDArray[np.float64]
 
@@ -139,9 +140,11 @@ def true_ends(drives: list[Array], robots: int, model: Model, rng: np.random.Gen
     return pose
 
 
-def fold(lines: Iterable[Line], model: Model, counts: int = 0) -> tuple[Array, Array]:
+def fold(
+    lines: Iterable[Line], model: Model, counts: int = 0, wheels: WheelMap = FOUR
+) -> tuple[Array, Array]:
     """Return the final pose and covariance of odometry."""
-    robot = Odometer(model.config(), counts)
+    robot = Odometer(model.config(), counts, wheels=wheels)
     for line in lines:
         estimate = robot.fold(line)
     pose, p = estimate.pose, estimate.covariance
@@ -180,6 +183,7 @@ def study(
     seed: int = 1,
     heard: Heard | None = None,
     counts: int = 0,
+    wheels: WheelMap = FOUR,
 ) -> Array:
     """Return the NEES of `runs` robots, spread over `drives` drives.
 
@@ -189,5 +193,5 @@ def study(
     paths = [reports(scenario(rng)) for _ in range(drives)]
     ends = true_ends(paths, runs // drives, model, rng)
     lines = [heard(path, rng) if heard else plain(path) for path in paths]
-    results = [fold(entry, model, counts) for entry in lines]
+    results = [fold(entry, model, counts, wheels) for entry in lines]
     return np.concatenate([nees(*entry, ends[:, i]) for i, entry in enumerate(results)])

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from acsard.core.config.settings import DriveConfig, LimitsConfig, OdometryConfig
+from acsard.core.config.settings import DriveConfig, LimitsConfig, OdometryConfig, WheelMap
 from acsard.core.link.feedback import Line
 from acsard.core.motion.agreement import claims
 from acsard.core.motion.consistency import ConsistencyChecks
@@ -13,6 +13,7 @@ from acsard.core.motion.kinematics import Kinematics, on_arc
 from acsard.core.motion.odometry import Odometry
 from acsard.core.motion.uncertainty import ErrorModel
 from acsard.core.values import Estimate, Pose, WheelSpeeds
+from tests.wheels import FOUR
 
 
 class Odometer:
@@ -21,9 +22,10 @@ class Odometer:
         odometry: OdometryConfig = OdometryConfig(),  # noqa: B008
         counts: int = 0,
         drive: DriveConfig = DriveConfig(),  # noqa: B008
+        wheels: WheelMap = FOUR,
     ) -> None:
-        kinematics = Kinematics(drive)
-        self.model = ErrorModel(odometry, kinematics, counts, LimitsConfig())
+        kinematics, limits = Kinematics(drive), LimitsConfig()
+        self.model = ErrorModel(odometry, kinematics, counts, limits, names=wheels.names)
         self.checks = ConsistencyChecks.initial(self.model)
         self.odometry = Odometry.initial(self.model)
         self._claims = claims(odometry, kinematics, counts)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 
-from acsard.core.config.settings import OdometryConfig
+from acsard.core.config.settings import OdometryConfig, WheelMap
 from acsard.core.motion.gyro import Turn
 from acsard.core.motion.uncertainty import UNKNOWN_POSE
 from acsard.core.values import Pose, PoseCovariance
@@ -16,6 +16,7 @@ from tests.each import each
 from tests.unit.nees import PERIOD, RADIUS, TRACK
 from tests.unit.odometer import Odometer
 from tests.unit.test_pose import Says, counts, feedback, line, moves
+from tests.wheels import MAPS
 
 law = settings(max_examples=100)
 START = PoseCovariance(1e-6, 0.0, 0.0, 1e-6, 0.0, 1e-6)
@@ -100,13 +101,15 @@ def test_turning_to_and_fro_counts_both_ways_but_trembling_within_a_count_does_n
     assert estimate.covariance.yawyaw < 2e-5
 
 
-def test_coarse_encoder_counts_make_the_pose_less_certain() -> None:
-    covariance = Odometer(counts=20).fold(line(0.0)).covariance
+@each("wheels", MAPS)
+def test_coarse_encoder_counts_make_the_pose_less_certain(wheels: WheelMap) -> None:
+    covariance = Odometer(counts=20, wheels=wheels).fold(line(0.0)).covariance
     # A count is 15.7 mm, and a wheel may be anywhere in it at the start and now. Each side is the
-    # mean of two wheels.
-    count = 0.05 * math.tau / 20
-    assert covariance.xx == pytest.approx(1e-6 + 2 * count**2 / 12 / 4)
-    assert covariance.yawyaw == pytest.approx(1e-6 + 2 * count**2 / 12 / 0.3**2)
+    # mean of its wheels.
+    count, on_a_side = 0.05 * math.tau / 20, len(wheels.names) / 2
+    of_side = 2 * count**2 / 12 / on_a_side
+    assert covariance.xx == pytest.approx(1e-6 + 2 * of_side / 4)
+    assert covariance.yawyaw == pytest.approx(1e-6 + 2 * of_side / 0.3**2)
 
 
 def yaw_variance(robot: Odometer) -> float:
@@ -251,15 +254,17 @@ def test_the_twist_of_a_robot_at_rest_is_certain() -> None:
     assert robot.fold(feedback(0.0, 0.1, 0.01)).twist_variances.angular > 1e-8
 
 
+@each("wheels", MAPS)
 @each(("encoder", "resolution"), [(0, 0.01), (400, math.tau / 400 / PERIOD)])
-def test_the_rounding_of_the_speeds_is_in_the_variance_of_the_turn_rate(
-    encoder: int, resolution: float
+def test_the_rounding_of_the_speeds_is_in_the_variances_of_the_twist(
+    encoder: int, resolution: float, wheels: WheelMap
 ) -> None:
-    robot = Odometer(EXACT, encoder)
+    robot = Odometer(EXACT, encoder, wheels=wheels)
     for _ in range(20):
-        estimate = robot.fold(feedback(4.0, 5.0, PERIOD))
-    expected = (RADIUS / TRACK * resolution) ** 2 / 12
-    assert estimate.twist_variances.angular == pytest.approx(expected)
+        variances = robot.fold(feedback(4.0, 5.0, PERIOD)).twist_variances
+    of_side = (RADIUS * resolution) ** 2 / 12 / (len(wheels.names) / 2)
+    assert variances.angular == pytest.approx(2 * of_side / TRACK**2)
+    assert variances.linear == pytest.approx(max(2 * of_side / 4, 1e-8))
 
 
 def test_a_pose_integrated_from_twists_is_as_uncertain_as_the_odometry() -> None:

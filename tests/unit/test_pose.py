@@ -9,16 +9,21 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from acsard.core.config.settings import OdometryConfig, WheelMap
 from acsard.core.link.feedback import Line
-from acsard.core.motion.gaps import AT_REST, LONG_S, Rolled, Skipped, rolled_over
+from acsard.core.motion.gaps import Rolled, Skipped, rolled_over
 from acsard.core.motion.gyro import Gyro, Turn
 from acsard.core.values import Estimate, Instant, Pose, Twist, WheelSpeeds
 from tests.each import each
 from tests.unit.odometer import Odometer
 from tests.vectors.drive import PATHS, SEED_STEP, SEED_STEP_ARC, SEED_STEP_TWIST
+from tests.wheels import FOUR, MAPS, TWO
 
 law = settings(max_examples=100)
 AT = Instant(5_000_000_000, 1_800_000_000_000_000_000)
+SURE = OdometryConfig(
+    distance_variance_per_metre=1e-8, yaw_variance_per_metre=1e-8, yaw_variance_per_radian=1e-8
+)
 Three = tuple[float, float, float]
 wheel_speed = st.floats(-40.0, 40.0)
 moves = st.lists(st.tuples(wheel_speed, wheel_speed, st.floats(0.0, 0.1)), max_size=30)
@@ -116,7 +121,7 @@ def roll(feedback: Line, *skipped: Line) -> Rolled:
     before = Skipped()
     for one in skipped:
         before.add(one)
-    return rolled_over(before, feedback, (10.0,) * 4, 4)
+    return rolled_over(before, feedback, (10.0,) * 4, None)
 
 
 @each(
@@ -145,15 +150,49 @@ def test_how_far_a_line_rolls(
     assert times == pytest.approx((seconds, filled, unknown))
 
 
-@each("wheel", range(4))
-def test_a_wheel_that_alone_is_fast_after_a_gap_does_not_fill_it(wheel: int) -> None:
-    speeds = [0.0] * 4
-    speeds[wheel] = 40.0
-    damaged = Line(AT, WheelSpeeds(*speeds), 0.31, bridged=0.3)
-    assert rolled_over(Skipped(), damaged, AT_REST, 4).angles == AT_REST
-    robot = Odometer()
-    robot.fold(line(0.0))
-    assert robot.fold(Line(AT, WheelSpeeds(*speeds), LONG_S + 0.04)).pose == Pose()
+@each("wheels", MAPS)
+@each("wheel", range(2))
+@each("speed", [0.0, 10.0])
+@each("false", [-30.0, 0.0, 18.0, 50.0])
+@each(("seconds", "bridged"), [(0.07, 0.0), (0.25, 0.0), (0.11, 0.1), (0.31, 0.3), (0.91, 0.9)])
+def test_a_false_speed_after_a_gap_or_in_a_long_line_does_not_make_a_wrong_pose_certain(
+    seconds: float, bridged: float, false: float, speed: float, wheel: int, wheels: WheelMap
+) -> None:
+    """The other wheel of its side outvotes it. Without one the pose is wrong, and says so."""
+    robot, driven = Odometer(SURE, wheels=wheels), WheelSpeeds(*[speed] * 4)
+    for _ in range(30):
+        robot.fold(line(speed), driven)
+    speeds = [speed] * 4
+    speeds[wheel] = false
+    if wheels is TWO:
+        speeds[3 - wheel] = false
+    robot.fold(Line(AT, WheelSpeeds(*speeds), seconds, bridged=bridged), driven)
+    pose, covariance = robot.pose, robot.fold(line(speed), driven).covariance
+    way = speed * 0.05 * (0.3 + seconds)
+    off, turned = math.dist((pose.x, pose.y), (way, 0.0)), abs(pose.yaw)
+    if wheels is FOUR:
+        assert max(off, turned) < 1e-9
+    assert turned < 1.2 * math.sqrt(covariance.yawyaw)
+    assert off < 1.2 * math.sqrt(covariance.xx + covariance.yy)
+
+
+def accelerated(wheels: WheelMap, period: float) -> Estimate:
+    """Return where a robot ends that obeys each command, with lines of this period."""
+    robot, speed = Odometer(wheels=wheels), 0.0
+    for goal in (10.0, -5.0, 0.0):
+        while speed != goal:
+            change = max(-20.0 * period, min(goal - speed, 20.0 * period))
+            speed = round(speed + change, 2)
+            estimate = robot.fold(line(speed, period), WheelSpeeds(*[goal] * 4))
+    return estimate
+
+
+@each("wheels", MAPS)
+def test_a_robot_that_obeys_is_as_certain_with_long_lines_as_with_short_ones(
+    wheels: WheelMap,
+) -> None:
+    long, short = accelerated(wheels, 0.1), accelerated(wheels, 0.01)
+    assert long.covariance.xx == pytest.approx(short.covariance.xx, rel=0.2)
 
 
 def test_gaps_and_bridged_times_are_counted_but_a_gap_at_rest_is_not() -> None:

@@ -19,6 +19,7 @@ from tests.each import each
 
 Array = NDArray[np.float64]
 PERIOD = 0.01
+DRIVEN = 4, 2
 
 
 def angles(seed: int, seconds: float, jitter: float) -> tuple[Array, Array]:
@@ -62,32 +63,65 @@ def lines(
         yield (a, b, c, d), number
 
 
-def found(encoders: CoarseEncoders, some: Iterable[Wheels4], elapsed: float = PERIOD) -> str:
+def of(driven: int, speeds: Iterable[float]) -> Wheels4:
+    """Return the speeds of four wheels; of two driven ones, the rear ones do as the front ones."""
+    a, b, c, d = speeds
+    return (a, b, c, d) if driven == 4 else (a, b, b, a)
+
+
+def found(encoders: CoarseEncoders, some: Iterable[Wheels4], driven: int = 4) -> str:
     for speeds in some:
-        encoders.step(speeds, elapsed)
+        encoders.step(of(driven, speeds), PERIOD, driven)
     return encoders.found
 
 
+@each("driven", DRIVEN)
 @each("counts", [16, 20, 48, 96])
 @each("jitter", [0.0, 0.002])
-def test_coarse_encoders_are_found_in_the_speeds(counts: int, jitter: float) -> None:
+def test_coarse_encoders_are_found_in_the_speeds(counts: int, jitter: float, driven: int) -> None:
     encoders = CoarseEncoders()
-    assert found(encoders, (speeds for speeds, _ in lines(counts, jitter))) == "coarse"
+    assert found(encoders, (speeds for speeds, _ in lines(counts, jitter)), driven) == "coarse"
     assert encoders.lines > 2000
 
 
+@each("driven", DRIVEN)
 @each("counts", [400, 1024, 3200])
 @each("window", [0.004, 0.005, 0.01])
 def test_fine_encoders_are_not_although_the_board_counts_for_less_than_a_line(
-    counts: int, window: float
+    counts: int, window: float, driven: int
 ) -> None:
     encoders, dice = CoarseEncoders(), random.Random(counts)
     for speeds, _ in lines(counts):
         step = math.tau / counts / window
-        a, b, c, d = [step * math.floor(speed / step + dice.random()) for speed in speeds]
-        encoders.step((a, b, c, d), PERIOD)
+        read = [step * math.floor(speed / step + dice.random()) for speed in speeds]
+        encoders.step(of(driven, read), PERIOD, driven)
         assert encoders.found != "coarse"
     assert (encoders.found, encoders.lines) == ("fine", 0)
+
+
+@each("driven", DRIVEN)
+@each(("share", "false", "most"), [(0.01, 2, 0.0), (0.05, 1, 0.005), (0.05, 2, 0.01)])
+def test_damaged_lines_are_seldom_taken_for_coarse_encoders(
+    share: float, false: int, most: float, driven: int
+) -> None:
+    """In a share of the lines, so many values have a digit with one false bit."""
+    encoders, dice, coarse, number = CoarseEncoders(), random.Random(2), 0, 0
+    for speeds, _ in lines(3200, 0.001):
+        read = [*speeds]
+        if dice.random() < share:
+            for wheel in dice.sample(range(driven), false):
+                read[wheel] = with_a_false_bit(read[wheel], dice)
+        encoders.step(of(driven, read), PERIOD, driven)
+        coarse, number = coarse + (encoders.found == "coarse"), number + 1
+    assert coarse <= most * number
+
+
+def with_a_false_bit(speed: float, dice: random.Random) -> float:
+    text, place, digit = bytearray(b"%05.2f" % abs(speed)), dice.choice((0, 1, 3, 4)), 0
+    while not b"0"[0] <= digit <= b"9"[0]:
+        digit = text[place] ^ 1 << dice.randrange(4)
+    text[place] = digit
+    return math.copysign(float(text), speed)
 
 
 def fine(count: int) -> list[Wheels4]:
@@ -108,7 +142,7 @@ def test_accelerations_and_single_damaged_wheels_do_not_look_like_coarse_encoder
 
 def test_encoders_may_turn_out_to_be_coarse_or_fine_after_all_and_are_unknown_before() -> None:
     encoders = CoarseEncoders()
-    assert encoders.step((0.0,) * 4, PERIOD) == math.inf
+    assert encoders.step((0.0,) * 4, PERIOD, 4) == math.inf
     assert found(encoders, fine(200)) == "fine"
     assert found(encoders, [(31.4, 31.4, 10.0, 10.0), (10.0,) * 4] * 3) == ""
     assert found(encoders, [(31.4,) * 4, (10.0,) * 4] * 3) == "coarse"
@@ -131,13 +165,15 @@ class WholeCounts:
         return self._whole.misfit < MAX_MISFIT
 
 
+@each("driven", DRIVEN)
 @each("counts", [16, 20, 96])
 @pytest.mark.parametrize("nominal", [False, True])
-def test_a_jitter_of_two_ms_loses_no_count(counts: int, nominal: bool) -> None:
+def test_a_jitter_of_two_ms_loses_no_count(counts: int, nominal: bool, driven: int) -> None:
     counter, total = WholeCounts(counts), np.zeros(4)
     for speeds, number in lines(counts, 0.002, nominal):
-        turned = counter.turned(speeds)
-        total += np.array(turned or [s * PERIOD for s in speeds]) / counter.angle - number
+        read = of(driven, speeds)
+        turned = counter.turned(read) or [s * PERIOD for s in read]
+        total += np.array(turned) / counter.angle - of(driven, number)
     assert counter.believed
     assert np.abs(total).max() < 0.01
 
@@ -169,6 +205,7 @@ def test_one_damaged_line_does_not_refute_whole_counts() -> None:
     assert counter.believed
 
 
+@each("driven", DRIVEN)
 @pytest.mark.parametrize(
     ("lost", "counts", "most"),
     [
@@ -177,13 +214,14 @@ def test_one_damaged_line_does_not_refute_whole_counts() -> None:
     ],
 )  # fmt: skip
 def test_a_missing_line_counts_once_whether_its_command_or_its_reply_was_lost(
-    lost: str, counts: int, most: float
+    lost: str, counts: int, most: float, driven: int
 ) -> None:
     """Every third command or reply is lost.
 
     After a lost reply the counts of a period are unknown. After a lost command nothing is.
     """
     way, at = angles(3, 60.0, 0.004)
+    way = np.array([of(driven, wheels) for wheels in way])
     whole = np.floor(way * counts / math.tau)
     indices = np.flatnonzero(np.arange(len(way)) % 3 != 0)
     recovery, total, before = Recovered(), np.zeros(4), np.zeros(4)

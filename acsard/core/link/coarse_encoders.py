@@ -27,9 +27,11 @@ JUMP_ANGLE, JUMP_SPEED = math.tau / 200, 5.0
 # A larger one is damage: no lie excuses itself. A board may count for less than the line's time.
 LARGEST_JUMP = 1.5 * COARSEST_COUNT
 
-# Jumps, each in the other direction than the one before, of a wheel in a block of `CHANGES` of the
-# speeds of all wheels: fewer are damaged lines.
-MIN_JUMPS, CHANGES = 3, 96
+# By the number of driven wheels: jumps, each in the other direction than the one before, of a wheel
+# in a block of `CHANGES` of the speeds of all wheels: fewer are damaged lines. If 5 % of the lines
+# have two false values, 0.5 % of the lines of four wheels count as coarse, and 0.6 % of two. It would
+# be 3 % with 3 jumps of two wheels.
+MIN_JUMPS, CHANGES = {4: 3, 2: 5}, 96
 
 # Over a longer time than this, a change of speed may be an acceleration.
 MAX_INTERVAL_S = 0.03
@@ -51,11 +53,12 @@ class CoarseEncoders(Struct):
         """Forget all lines: the board has restarted or was replaced."""
         self.found, self.changes, self.jumps = "", 0, [0] * 4
 
-    def step(self, speeds: Wheels4, elapsed: Seconds) -> RadPerS:
+    def step(self, speeds: Wheels4, elapsed: Seconds, driven: int) -> RadPerS:
         """Add a line, and return a bound of the change of a speed by one count.
 
         It is inf if unknown, and 0 for fine encoders, whose counts a motor's own changes cover.
-        `elapsed` is the time since the line before it, which may have been lost.
+        `elapsed` is the time since the line before it, which may have been lost, and `driven` the
+        number of driven wheels.
         """
         seconds = elapsed if elapsed > MIN_COUNT_S else MIN_COUNT_S
         fine = JUMP_ANGLE / seconds
@@ -63,7 +66,7 @@ class CoarseEncoders(Struct):
         # The counts of either line may cause the change.
         largest = LARGEST_JUMP / (seconds if seconds > self.seconds else self.seconds)
         if speeds != self.speeds:
-            self._compare(speeds, fine, largest)
+            self._compare(speeds, fine, largest, MIN_JUMPS[driven])
             self.speeds = speeds
         self.seconds = seconds
         if self.found == "fine":
@@ -73,7 +76,7 @@ class CoarseEncoders(Struct):
             return LARGEST_JUMP / seconds
         return math.inf
 
-    def _compare(self, speeds: Wheels4, least: RadPerS, most: RadPerS) -> None:
+    def _compare(self, speeds: Wheels4, least: RadPerS, most: RadPerS, enough: int) -> None:
         jumps, rises = self.jumps, self.rises
         for wheel, (now, before) in enumerate(zip(speeds, self.speeds, strict=True)):
             change = now - before
@@ -83,13 +86,14 @@ class CoarseEncoders(Struct):
                 if size > least and (change > 0.0) is not rises[wheel]:
                     rises[wheel] = change > 0.0
                     jumps[wheel] += 1
-        # One wheel may have a dead encoder, and damaged lines may have two false speeds.
+        # One wheel of four may have a dead encoder, and damaged lines may have two false speeds. Of
+        # two, `third` is the one that jumps less, and `second` the other.
         _, third, second, _ = sorted(jumps)
-        if third >= MIN_JUMPS:
+        if third >= enough:
             self.found = "coarse"
-        elif second >= MIN_JUMPS and self.found == "fine":
+        elif second >= enough and self.found == "fine":
             self.found = ""
         if self.changes >= CHANGES:
-            if second < MIN_JUMPS:
+            if second < enough:
                 self.found = "fine"
             self.changes, self.jumps = 0, [0] * 4

@@ -185,7 +185,7 @@ class Timeline(Struct):
             else:
                 self.whole.carried = 0.0
         else:
-            step = self.coarse.step(wheels, elapsed)
+            step = self.coarse.step(wheels, elapsed, len(setup.codec.letters))
         expected_ns = expected_ns if expected_ns < came_ns else came_ns
         # Pass the fields by position: creating a struct by its names takes three times as long.
         return Line(

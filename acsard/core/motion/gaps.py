@@ -12,7 +12,9 @@ from msgspec import Struct
 from acsard.core.link.feedback import MAX_FILLED_GAP_S, Line
 from acsard.core.values import Seconds, Wheels4
 
-LONG_S = 0.06  # a line for more than this is judged like a gap
+# By the number of driven wheels: a line for more than this is judged like a gap. A false speed of
+# one wheel is a quarter of the motion, or half of it.
+LONG_S = {4: 0.06, 2: 0.03}
 
 AT_REST: Wheels4 = (0.0, 0.0, 0.0, 0.0)
 
@@ -43,12 +45,16 @@ class Rolled(Struct, frozen=True, gc=False):
     seconds: Seconds  # in which they rolled them
     filled: Seconds  # part of `seconds` for which no line speaks
     unknown: Seconds  # in addition to `seconds`
+    alone: Wheels4 = AT_REST  # part of `angles` that one speed of one line says, and nothing else
 
 
-def rolled_over(skipped: Skipped, line: Line, before: Wheels4, independent: int) -> Rolled:
-    """Return the angles since the last plausible line, which had the speeds `before`, rad/s."""
+def rolled_over(skipped: Skipped, line: Line, before: Wheels4, commanded: Wheels4 | None) -> Rolled:
+    """Return the angles since the last plausible line, which had the speeds `before`, rad/s.
+
+    `commanded` is None if there are two wheels on a side.
+    """
     speeds = line.speeds.as_tuple()
-    if independent == 4:
+    if commanded is None:
         speeds = _confirmed(before, speeds)
     if line.turned is not None:
         seconds, filled, unknown, angles = line.dt, 0.0, 0.0, line.turned
@@ -63,19 +69,32 @@ def rolled_over(skipped: Skipped, line: Line, before: Wheels4, independent: int)
         filled, unknown = 0.0, unknown + filled
     if filled:
         angles = plus(angles, times(plus(before, speeds), filled / 2))
-    return Rolled(angles, seconds + filled, filled, unknown)
+    alone = AT_REST
+    if commanded is not None and line.turned is None:
+        beyond = _beyond(before, speeds, commanded)
+        alone = times(beyond, line.dt - line.bridged + filled / 2)
+    return Rolled(angles, seconds + filled, filled, unknown, alone)
 
 
 def _confirmed(before: Wheels4, after: Wheels4) -> Wheels4:
     # Motion changes both wheels of a side alike, damage one of them. In a usual line it matters
-    # little; here, take the median of each wheel, the other one of its side and its last speed. If
-    # each wheel is alone on its side, there are only two values, and neither outvotes the other.
+    # little; here, take the median of each wheel, the other one of its side and its last speed.
     fr, fl, rl, rr = after
     was_fr, was_fl, was_rl, was_rr = before
     return (
         sorted((fr, rr, was_fr))[1], sorted((fl, rl, was_fl))[1],
         sorted((rl, fl, was_rl))[1], sorted((rr, fr, was_rr))[1],
     )  # fmt: skip
+
+
+def _beyond(before: Wheels4, after: Wheels4, commanded: Wheels4) -> Wheels4:
+    # A wheel turns at a speed between its last one and its command. If it is alone on its side, no
+    # other value outvotes a damaged one beyond both: the pose takes it, and doubts it as much.
+    fr, fl, rl, rr = [
+        now - min(max(now, min(was, wish)), max(was, wish))
+        for was, now, wish in zip(before, after, commanded, strict=True)
+    ]
+    return fr, fl, rl, rr
 
 
 def plus(a: Wheels4, b: Wheels4) -> Wheels4:

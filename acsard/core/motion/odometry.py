@@ -79,9 +79,11 @@ class Odometry(Struct):
         """
         speeds, wheels, gap = line.speeds, checks.wheels, None
         reported, seconds = speeds.as_tuple(), line.dt
-        if line.bridged or line.gap or self.skipped.lines or seconds > LONG_S:
-            before = self.speeds.as_tuple()
-            gap = rolled_over(self.skipped, line, before, model.independent)
+        if line.bridged or line.gap or self.skipped.lines or seconds > LONG_S[model.independent]:
+            commanded = None
+            if model.independent == 2:
+                commanded = (wheels.commanded or STILL).as_tuple()
+            gap = rolled_over(self.skipped, line, self.speeds.as_tuple(), commanded)
             self.skipped = Skipped()
             rolled, seconds = gap.angles, gap.seconds
         else:
@@ -122,7 +124,8 @@ class Odometry(Struct):
         self.path = Path(
             path.way + way, path.turned + turned, path.gyro_variance + variance, path.lines + 1
         )
-        uncertainty.seconds += seconds
+        # A gap is no period of the lines.
+        uncertainty.seconds += seconds - (gap.filled if gap and model.independent == 2 else 0.0)
         doubts = wheels.possible_motion(rolled)
         due |= line.doubt is not None or (turn is not None and turn.doubt != 0.0)
         if due or gap or doubts or self.was_set or uncertainty.seconds >= UPDATE_S:
@@ -165,6 +168,9 @@ class Odometry(Struct):
         after, uncertainty, filled, unknown = self.twist, self.uncertainty, gap.filled, gap.unknown
         linear, angular = before.linear - after.linear, before.angular - after.angular
         turns = 0.0 if by_gyro else 1.0  # a gyro misses no turn
+        if gap.alone != AT_REST:
+            distance, angle = model.kinematics.moved(gap.alone)
+            uncertainty.miss("gap", -distance, -turns * angle, heading)
         if filled:
             self.filled += filled
             # The speed may have changed at the begin of the gap, or at its end, and the next time

@@ -157,7 +157,11 @@ class ErrorModel:
         """
         speed, acceleration = self.speed, self.acceleration
         short = min(seconds, MAX_FILLED_GAP_S)  # then the robot was stopped
-        quantum = self.independent / 2 * (self.unsettled / 2 / period * short) ** 2
+        quantum = 2 * (self.unsettled / 2 / period * short) ** 2
+        if self.independent == 2:
+            # A count is missed in the gap, too: in one lost line, it is five times the above.
+            count = self.unsettled / 2
+            quantum = (count / period * short + count) ** 2 + count**2
         along = min(acceleration.linear * short / 4, speed.linear) * short
         yaw = min(acceleration.angular * short / 4, speed.angular) * short
         return along**2 + self.of_speed[0] * quantum, yaw**2 + self.of_speed[1] * quantum
