@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from acsard.core.config.settings import FeedbackConfig, McuConfig
+from acsard.core.config.settings import FeedbackConfig, McuConfig, WheelMap
 from acsard.core.link.board_counts import Encoders, Turned, Unknown
 from acsard.core.link.checked_line import Checked, Reading, seal, unseal
 from acsard.core.link.codec import FrameError
@@ -18,10 +18,12 @@ from acsard.core.link.link_state import BAD_LINES
 from tests.each import each
 from tests.unit.link_bench import BAD, CHECKED, GOOD, MS, PLAIN, LinkBench
 from tests.vectors.lines import SEED_LINE, ZERO
+from tests.wheels import FOUR, MAPS
 
 law = settings(max_examples=100)
 REPLY = b"ap12.50,bn08.75,cp15.00,dn10.25#07*585F"
 SAMPLE = b"ap12.50,bn08.75,cp15.00,dn10.25#07@0FA00001FFFF80007FFF"
+SAMPLE_OF_TWO = b"lp12.50,rn08.75#07@0FA00001FFFF"
 
 
 def crc(data: bytes) -> int:
@@ -39,9 +41,9 @@ def closed(body: bytes) -> bytes:
     return b"%b*%04X" % (body, crc(body))
 
 
-def reason(line: bytes) -> str:
+def reason(line: bytes, motors: int = 4) -> str:
     with pytest.raises(FrameError) as caught:
-        unseal(line, 4)
+        unseal(line, motors)
     return caught.value.reason
 
 
@@ -51,6 +53,7 @@ def reason(line: bytes) -> str:
         (SEED_LINE, 0, b"", b"#00"), (SEED_LINE, 7, b"", b"#07"), (SEED_LINE, 255, b"S", b"#FFS"),
         (SEED_LINE, 171, b"S", b"#ABS"),
         (SEED_LINE + b",", 7, b"", b"#07"),  # the comma of the dialect stays before it
+        (b"lp12.50,rn08.75", 7, b"S", b"#07S"),
     ],
 )  # fmt: skip
 def test_a_sealed_command_is_the_line_followed_by_its_suffix_and_check(
@@ -69,6 +72,10 @@ def test_the_examples_of_the_protocol_are_right() -> None:
     assert len(line) + 2 == 62 < MAX_LINE_BYTES
     reading = Reading(0x0FA0, (0x0001, 0xFFFF, 0x8000, 0x7FFF))
     assert unseal(line, 4) == Checked(SEED_LINE, 7, reading)
+    of_both = closed(SAMPLE_OF_TWO)
+    assert unseal(of_both, 2) == Checked(b"lp12.50,rn08.75", 7, Reading(0x0FA0, (0x0001, 0xFFFF)))
+    # The counts of another number of motors.
+    assert reason(line, 2) == reason(of_both, 4) == "malformed"
 
 
 @each(
@@ -85,15 +92,15 @@ def test_a_suffix_of_another_form_is_wrong_even_under_a_right_check(suffix: byte
     assert reason(closed(b"\0\0" + SEED_LINE + b"#07")) == "crc_error"
 
 
-@each("line", [REPLY, closed(SAMPLE)])
-def test_no_single_or_double_bit_error_leaves_a_right_line(line: bytes) -> None:
+@each(("line", "motors"), [(REPLY, 4), (closed(SAMPLE), 4), (closed(SAMPLE_OF_TWO), 2)])
+def test_no_single_or_double_bit_error_leaves_a_right_line(line: bytes, motors: int) -> None:
     bits = len(line) * 8
     number = int.from_bytes(line, "big")
     singles = [1 << bit for bit in range(bits)]
     doubles = [1 << bit | 1 << (bit * 7 + 3) % bits for bit in range(bits)]
     for error in singles + [e for e in doubles if e & (e - 1)]:
         damaged = (number ^ error).to_bytes(len(line), "big")
-        assert reason(damaged) in ("crc_error", "without_crc")
+        assert reason(damaged, motors) in ("crc_error", "without_crc")
 
 
 @law
@@ -214,11 +221,12 @@ WRAP_MS = 32768 / (FASTEST / math.tau * COUNTS) * 1000
 class Board:
     """The readings of a board, and the host's time of each reading."""
 
-    def __init__(self) -> None:
-        mcu = McuConfig(link_check="on", encoder_counts=COUNTS)
+    def __init__(self, wheels: WheelMap = FOUR) -> None:
+        self.motors = len(wheels.names)
+        mcu = McuConfig(link_check="on", encoder_counts=COUNTS, wheels=wheels)
         self.setup = LinkSetup.of(mcu, 100.0, FeedbackConfig(wheel_speed=FASTEST))
         self.encoders, self.mcu_ms, self.at_ms = Encoders(), 60_000.0, 5_000.0
-        self.counts = [65_000, 100, 32_768, 0]
+        self.counts = [65_000, 100, 32_768, 0][: self.motors]
         assert self.read() == "unknown"
 
     def read(
@@ -227,20 +235,22 @@ class Board:
         """Advance both clocks and the counts by these amounts and return the result."""
         self.mcu_ms += mcu_ms
         self.at_ms += mcu_ms if host_ms is None else host_ms
-        self.counts = [c + m for c, m in zip(self.counts, counts or (0,) * 4, strict=True)]
-        a, b, c, d = (count % 65536 for count in self.counts)
-        reading = Reading(int(self.mcu_ms) % 65536, (a, b, c, d))
+        moved = counts or (0,) * self.motors
+        self.counts = [c + m for c, m in zip(self.counts, moved, strict=True)]
+        read = tuple(count % 65536 for count in self.counts)
+        reading = Reading(int(self.mcu_ms) % 65536, read)
         return self.encoders.turned(self.setup, reading, int(self.at_ms * MS))
 
     def goes_on(self) -> bool:
-        return self.read(10, (5, 5, 5, 5)) == turned(5, 5, 5, 5)
+        five = (5,) * self.motors
+        return self.read(10, five) == turned(*five)
 
 
 def turned(*counts: int, dt: float = 0.01) -> Turned:
-    a, b, c, d = (count * (math.tau / COUNTS) for count in counts)
-    return Turned((a, b, c, d), dt)
+    return Turned(tuple(count * (math.tau / COUNTS) for count in counts), dt)
 
 
+@each("wheels", MAPS)
 @each(
     ("mcu_ms", "counts", "host_ms"),
     [
@@ -252,9 +262,11 @@ def turned(*counts: int, dt: float = 0.01) -> Turned:
     ],
 )
 def test_a_reading_gives_the_turned_angles_whenever_the_host_reads_it(
-    mcu_ms: int, counts: tuple[int, ...], host_ms: float
+    mcu_ms: int, counts: tuple[int, ...], host_ms: float, wheels: WheelMap
 ) -> None:
-    assert Board().read(mcu_ms, counts, host_ms) == turned(*counts, dt=mcu_ms / 1000)
+    board = Board(wheels)
+    counts = counts[: board.motors]
+    assert board.read(mcu_ms, counts, host_ms) == turned(*counts, dt=mcu_ms / 1000)
 
 
 @law
@@ -301,11 +313,13 @@ def test_what_no_reading_can_tell(mcu_ms: float, host_ms: float, result: str) ->
     assert board.goes_on()
 
 
-@each("motor", range(4))
+@each(("wheels", "motor"), [(wheels, n) for wheels in MAPS for n in range(len(wheels.names))])
 @each("sign", [1, -1])
-def test_a_movement_beyond_the_fastest_speed_is_a_leap(motor: int, sign: int) -> None:
+def test_a_movement_beyond_the_fastest_speed_is_a_leap(
+    wheels: WheelMap, motor: int, sign: int
+) -> None:
     # Two ms of rounding and four counts of play.
-    board, moved = Board(), [0] * 4
+    board, moved = Board(wheels), [0] * len(wheels.names)
     moved[motor] = sign * (int(FASTEST / math.tau * COUNTS * 0.012) + 4)
     assert isinstance(board.read(10, tuple(moved)), Turned)
     moved[motor] += 2 * sign

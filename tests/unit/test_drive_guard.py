@@ -27,20 +27,19 @@ from acsard.core.values import (
     WheelSpeeds,
 )
 from tests.each import each
+from tests.wheels import FOUR, MAPS, TWO
 
 MS = 1_000_000
 NOW_NS = 50 * NS_PER_S
 SOURCES = (Source("app", 50), Source("slow", 10, timeout=1.0))
-CODEC = Codec(WheelMap())
 STOP = b"ap00.00,bp00.00,cp00.00,dp00.00\r\n"
-COMMA_STOP = STOP[:-2] + b",\r\n"
 DAMAGED, FAST, NO_LINK = "guard_line_damaged", "guard_too_fast", "guard_no_link"
 GROWS, LATE = "guard_no_command", "guard_too_long"
 
 
-def line(*wheels: float) -> bytes:
-    """Return the line with these speeds for a, b, c, d. A single number is for all of them."""
-    return CODEC.encode(WheelSpeeds(*(wheels * 4 if len(wheels) == 1 else wheels)))
+def line(*speeds: float, wheels: WheelMap = FOUR) -> bytes:
+    """Return the line with these speeds of the wheels. A single number is for all of them."""
+    return Codec(wheels).encode(WheelSpeeds(*(speeds * 4 if len(speeds) == 1 else speeds)))
 
 
 class Guarded:
@@ -49,12 +48,14 @@ class Guarded:
     def __init__(
         self,
         wheel_speed: float = 40.0,
-        stop: bytes = STOP,
+        stop: bytes = b"",
         limits: LimitsConfig | None = None,
         link_check: str = "off",
+        wheels: WheelMap = FOUR,
     ) -> None:
-        limits = limits or LimitsConfig(wheel_speed=wheel_speed)
-        mcu = McuConfig(link_check=link_check)  # type: ignore[arg-type]
+        limits, self.wheels = limits or LimitsConfig(wheel_speed=wheel_speed), wheels
+        stop = stop or Codec(wheels).stop
+        mcu = McuConfig(link_check=link_check, wheels=wheels)  # type: ignore[arg-type]
         config = Config(mcu=mcu, limits=limits, commands=CommandsConfig(sources=SOURCES))
         self.guard, self.stop = Guard(stop, config), stop
 
@@ -78,10 +79,10 @@ class Guarded:
     def coast(self, data: bytes) -> Trip:
         return self.check(data, "ready", source="", age_ms=None)
 
-    def sent(self, *wheels: float) -> Guarded:
+    def sent(self, *speeds: float) -> Guarded:
         """Check and send this line of a fresh command, or send the one that was checked last."""
-        if wheels:
-            assert self.check(line(*wheels)) == ""
+        if speeds:
+            assert self.check(line(*speeds, wheels=self.wheels)) == ""
         self.guard.record_written(self.passed)
         return self
 
@@ -115,10 +116,25 @@ def test_what_is_not_one_line_of_the_dialect_becomes_stop(data: bytes) -> None:
     assert Guarded().check(data) == DAMAGED
 
 
+@each(
+    "data",
+    [
+        b"lp01.00\r\n", b"lp01.00,rp01.00", b"lp01.00,rp01.00,\r\n", b"lp01.00,rp1.00\r\n",
+        b"rp01.00,lp01.00\r\n", b"lp01.00,lp01.00\r\n", b"lp01.00, rp01.00\r\n",
+        b"lp01.00,rp001.0\r\n", b"lp01.00,rpnanan\r\n", b"ap01.00,bp01.00\r\n",
+        b"lp01.00,rp01.00,ap01.00,bp01.00\r\n", b"ap01.00,bp01.00,cp01.00,dp01.00\r\n",
+        b"lp01.00,rp01.00\r\n" * 2, b"lp90.00,rp90.00\r\nlp01.00,rp01.00\r\n",
+    ],
+)  # fmt: skip
+def test_what_is_not_one_line_of_two_motors_becomes_stop(data: bytes) -> None:
+    assert Guarded(wheels=TWO).check(data) == DAMAGED
+
+
 @settings(max_examples=100)
 @given(data=st.binary(max_size=40).filter(lambda data: data != b"?\r\n"))
 def test_noise_never_passes(data: bytes) -> None:
-    assert Guarded().check(data) == DAMAGED
+    for wheels in MAPS:
+        assert Guarded(wheels=wheels).check(data) == DAMAGED
 
 
 def test_a_question_passes_in_every_state_and_changes_no_speed() -> None:
@@ -132,25 +148,29 @@ def test_a_question_passes_in_every_state_and_changes_no_speed() -> None:
     assert guarded.check(line(1.1), age_ms=290) == GROWS
 
 
+@each("wheels", MAPS)
 @each("letters", [b"", b"S"])
 @each("comma", [False, True])
-def test_a_checksum_must_be_right_and_a_checked_link_needs_it(comma: bool, letters: bytes) -> None:
-    stop = COMMA_STOP if comma else STOP
-    codec = Codec(WheelMap(), comma)
+def test_a_checksum_must_be_right_and_a_checked_link_needs_it(
+    comma: bool, letters: bytes, wheels: WheelMap
+) -> None:
+    codec = Codec(wheels, comma)
+    stop = codec.stop
     for sequence in (0, 7, 255):
         good = seal(codec.encode(WheelSpeeds(12.5, -8.75, 15.0, -10.25)), sequence, letters)
-        assert Guarded(stop=stop, link_check="on").check(good) == ""
+        assert Guarded(stop=stop, link_check="on", wheels=wheels).check(good) == ""
         for place in range(len(good)):
             for bit in range(8):
                 bad = b"%b%c%b" % (good[:place], good[place] ^ 1 << bit, good[place + 1 :])
-                assert Guarded(stop=stop).check(bad) == DAMAGED
-    required = Guarded(link_check="on")
-    assert (required.check(line(1.0)), required.check(STOP)) == ("guard_no_checksum", "")
+                assert Guarded(stop=stop, wheels=wheels).check(bad) == DAMAGED
+    required, stop = Guarded(link_check="on", wheels=wheels), Codec(wheels).stop
+    one, fast = line(1.0, wheels=wheels), line(41.0, wheels=wheels)
+    assert (required.check(one), required.check(stop)) == ("guard_no_checksum", "")
     # A checked line keeps the same limits.
-    assert required.check(seal(line(41.0), 7)) == FAST
-    assert required.check(seal(line(1.0), 7), linked=False) == NO_LINK
-    assert required.coast(seal(line(1.0), 7)) == GROWS
-    assert required.check(seal(STOP, 7), "fault", linked=False) == ""
+    assert required.check(seal(fast, 7)) == FAST
+    assert required.check(seal(one, 7), linked=False) == NO_LINK
+    assert required.coast(seal(one, 7)) == GROWS
+    assert required.check(seal(stop, 7), "fault", linked=False) == ""
 
 
 @each(
@@ -168,33 +188,45 @@ def test_an_unknown_suffix_is_refused_with_a_right_checksum(suffix: bytes, lette
 MODES = ("inactive", "waiting", "ready", "driving", "stopped", "fault", "shutdown", "", "Driving")
 
 
+@each("wheels", MAPS)
 @each("limit", [0.1, 0.294, 0.295, 0.296, 1.005, 39.996, 40.0, 99.985, 99.99])
-def test_no_wheel_may_be_faster_than_its_limit_however_it_is_rounded(limit: float) -> None:
-    for wheel in range(4):
+def test_no_wheel_may_be_faster_than_its_limit_however_it_is_rounded(
+    limit: float, wheels: WheelMap
+) -> None:
+    for wheel in range(len(wheels.names)):
         for sign in (1.0, -1.0):
             speeds = [0.0, 0.0, 0.0, 0.0]
             speeds[wheel] = sign * limit
-            assert Guarded(limit).check(line(*speeds)) == ""
+            assert Guarded(limit, wheels=wheels).check(line(*speeds, wheels=wheels)) == ""
             speeds[wheel] = sign * (limit + 0.02)
             if limit < 99.9:
-                assert Guarded(limit).check(line(*speeds)) == FAST
+                assert Guarded(limit, wheels=wheels).check(line(*speeds, wheels=wheels)) == FAST
 
 
+@each("wheels", MAPS)
 @each("mode", MODES)
-def test_zero_passes_always_and_without_a_link_nothing_else(mode: str) -> None:
+def test_zero_passes_always_and_without_a_link_nothing_else(mode: str, wheels: WheelMap) -> None:
+    def moving() -> Guarded:
+        return Guarded(wheels=wheels).sent(10.0)
+
     for linked in (True, False):
-        assert Guarded().sent(10.0).check(STOP, mode, linked, age_ms=None) == ""
-    assert Guarded().sent(10.0).check(line(0.0, 0.0, 0.0, 0.01), mode, linked=False) == NO_LINK
-    assert Guarded().check(line(1.0), mode) == ("" if mode == "driving" else GROWS)
+        assert moving().check(Codec(wheels).stop, mode, linked, age_ms=None) == ""
+    little, one = line(0.0, 0.01, 0.0, 0.01, wheels=wheels), line(1.0, wheels=wheels)
+    assert moving().check(little, mode, linked=False) == NO_LINK
+    assert Guarded(wheels=wheels).check(one, mode) == ("" if mode == "driving" else GROWS)
 
 
+@each("wheels", MAPS)
 @each(("before", "speed"), [(10.0, 10.01), (10.0, -0.01), (0.01, -0.01)])
-def test_without_a_command_no_wheel_may_speed_up_or_reverse(before: float, speed: float) -> None:
-    for wheel in range(4):
+def test_without_a_command_no_wheel_may_speed_up_or_reverse(
+    before: float, speed: float, wheels: WheelMap
+) -> None:
+    for wheel in range(len(wheels.names)):
         for sign in (1.0, -1.0):
             speeds = [sign * min(9.0, before)] * 4
             speeds[wheel] = sign * speed
-            assert Guarded().sent(sign * before).coast(line(*speeds)) == GROWS
+            guarded = Guarded(wheels=wheels).sent(sign * before)
+            assert guarded.coast(line(*speeds, wheels=wheels)) == GROWS
     assert Guarded().sent(5.0, 0.0, -5.0, 0.0).coast(line(4.0, 0.0, -4.0, 0.0)) == ""
 
 

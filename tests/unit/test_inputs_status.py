@@ -23,6 +23,8 @@ REPLIES = (
     b"ap1.5, bn8.75, cp15.000, dn10.25,",
     b"ap12.50,bn08.75,cp15.00,dn10.25#07*585F",
     b"ap00.00,bp00.00,cp00.00,dp00.00#07@0102AAAABBBBCCCCDDDD*1234",
+    b"lp12.50,rn08.75",
+    b"lp00.00,rp00.00#07@0102AAAABBBB*1234",
 )
 
 

@@ -53,6 +53,8 @@ HEARD: dict[str, tuple[bytes, str, str]] = {
     "a motor twice": (b"ap00.00,ap00.00,bp00.00,dp00.00\r\n", "letters", "none good"),
     "three values": (b"ap00.00,bp00.00,cp00.00\r\n" * 4, "cut", "none good"),
     "a wrong check": (b"ap00.00,bp00.00,cp00.00,dp00.00#07*0000\r\n", "foreign", "none good"),
+    "two motors": (b"lp00.00,rp00.00\r\n", "letters", "the last one is `lp00.00,rp00.00`"),
+    "two motors, with checks": (b"lp00.00,rp00.00#07*585F\r\n", "letters", "none good"),
     "some good": (
         STOP + b"ap?\r\n", "few", "2 lines received, only 1 good, the last bad one is `ap?`"
     ),
@@ -60,14 +62,36 @@ HEARD: dict[str, tuple[bytes, str, str]] = {
 }  # fmt: skip
 
 
-@each(("data", "looks", "counted"), list(HEARD.values()))
+STOP_OF_TWO = b"lp00.00,rp00.00\r\n"
+HEARD_OF_TWO: dict[str, tuple[bytes, str, str]] = {
+    "half lines": (b"lp00.00,r" * 9, "cut", "81 bytes received but no line end"),
+    "cut lines": (b"lp00.00,r\r\n" * 4, "cut", "none good, the last one is `lp00.00,r`"),
+    "noise": ((b"\x00\xff~" + STOP_OF_TWO) * 144, "foreign", "none good"),
+    "wrong baud rate": (b"\xf8\x00\xe6\n\x9e" * 3, "garbage", "3 lines received, none good"),
+    "text": (b"[I][main] heap 182344\r\n" * 3 + STOP_OF_TWO, "text", "only 1 good"),
+    "another form": (b"lp 0.00,rp 0.00\r\n", "form", "none good"),
+    "four motors": (STOP, "letters", "the last one is `ap00.00,bp00.00,cp00.00,dp00.00`"),
+    "other motors": (b"ap00.00,bp00.00\r\n", "letters", "none good"),
+    "one motor twice": (b"lp00.00,lp00.00\r\n", "letters", "none good"),
+    "some good": (STOP_OF_TWO + b"lp?\r\n", "few", "the last bad one is `lp?`"),
+    "all good": (STOP_OF_TWO * 2, "sparse", "2 lines received, all of them good"),
+}
+
+
+@each(
+    ("stop", "data", "looks", "counted"),
+    [
+        *((STOP, *row) for row in HEARD.values()),
+        *((STOP_OF_TWO, *row) for row in HEARD_OF_TWO.values()),
+    ],
+)
 def test_the_diagnosis_says_what_was_received_and_how_it_looks(
-    data: bytes, looks: str, counted: str
+    stop: bytes, data: bytes, looks: str, counted: str
 ) -> None:
     heard = Traffic()
     heard.take(data)
     for line, _ in LineReader().feed(data):
-        heard.line(line, line + b"\r\n" == STOP, "abcd")
+        heard.line(line, line + b"\r\n" == stop, stop[::8].decode().strip())
     assert heard.code == heard.diagnosis().code == f"received_{looks}"
     assert counted in heard.counted
     assert heard.counted in heard.diagnosis().text

@@ -21,7 +21,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from msgspec.structs import replace
 
-from acsard.core.config.settings import Baud, Config, McuConfig, SimConfig
+from acsard.core.config.settings import Baud, Config, McuConfig, SimConfig, WheelMap
 from acsard.core.simulator import protocol
 from acsard.core.simulator.baud_mismatch import garbled
 from acsard.core.simulator.fake_mcu import MS, RESET_NS, FakeMcu
@@ -30,6 +30,7 @@ from acsard.core.simulator.virtual_wire import VirtualWire
 from acsard.daemon.serial.simulator_pty import SimPty
 from acsard.host import clock
 from tests.each import each
+from tests.wheels import FOUR, TWO, four_and_two
 
 PLAIN = b"ap12.50,bn08.75,cp15.00,dn10.25"
 LINE = PLAIN + b"\r\n"
@@ -64,37 +65,51 @@ def drive(mcu: FakeMcu, start_ns: int, count: int, line: bytes = LINE) -> Heard:
 
 # The board and an independent model of it.
 
-TOKENS = b",".join(b"%c([pn])(\\d\\d\\.\\d\\d)" % motor for motor in b"abcd")
-WHOLE = re.compile(TOKENS + rb",?\r?\n")
-
 
 class Model:
-    """Obeys the last whole line for 300 ms."""
+    """Obeys the last whole line for 300 ms. Its speeds are those of the four simulated wheels."""
 
-    def __init__(self) -> None:
+    def __init__(self, wheels: WheelMap) -> None:
         self.speeds, self.until_ms, self.valid = STILL, -1.0, 0
+        self.two, letters = wheels is TWO, wheels.letters.encode()
+        tokens = b",".join(b"%c([pn])(\\d\\d\\.\\d\\d)" % motor for motor in letters)
+        self.whole = re.compile(tokens + rb",?\r?\n")
 
     def hears(self, line: bytes, ends_ms: float) -> None:
-        if found := WHOLE.fullmatch(line):
+        if found := self.whole.fullmatch(line):
             signs, values = found.groups()[0::2], found.groups()[1::2]
-            self.speeds = [
+            speeds = [
                 float(v) * (1 if s == b"p" else -1) for s, v in zip(signs, values, strict=True)
             ]
+            if self.two:  # l is left, and r is right
+                left, right = speeds
+                speeds = [right, left, left, right]
+            self.speeds = speeds
             self.until_ms, self.valid = ends_ms + 300, self.valid + 1
+
+    def at(self, now_ms: float) -> list[float]:
+        """Return the speeds at this time, which is not within 5 ms of the watchdog's."""
+        if now_ms > self.until_ms + 5:
+            self.speeds = STILL
+        return self.speeds
 
 
 speed = st.tuples(st.sampled_from("pn"), st.integers(0, 9999)).map(
     lambda value: f"{value[0]}{value[1] / 100:05.2f}"
 )
-whole = st.tuples(speed, speed, speed, speed, st.sampled_from(["\r\n", "\n", ",\r\n"])).map(
-    lambda of: ("a{},b{},c{},d{}{}".format(*of)).encode()
-)
+ends = st.sampled_from(["\r\n", "\n", ",\r\n"])
+WHOLE = {
+    FOUR: st.tuples(speed, speed, speed, speed, ends).map(
+        lambda of: ("a{},b{},c{},d{}{}".format(*of)).encode()
+    ),
+    TWO: st.tuples(speed, speed, ends).map(lambda of: ("l{},r{}{}".format(*of)).encode()),
+}
 
 
 @st.composite
-def damaged(draw: st.DrawFn) -> bytes:
+def damaged(draw: st.DrawFn, wheels: WheelMap) -> bytes:
     """Return a line in which up to two places are lost, doubled or replaced."""
-    line = draw(whole)[:-1]
+    line = draw(WHOLE[wheels])[:-1]
     for _ in range(draw(st.integers(1, 2))):
         at = draw(st.integers(0, len(line) - 1))
         others = st.sampled_from([b"", b"x", b" ", b",", b"\x00", b"\xff", b"-", b"9", b"ap1"])
@@ -102,11 +117,15 @@ def damaged(draw: st.DrawFn) -> bytes:
     return line + b"\n"
 
 
-@given(st.lists(st.tuples(st.sampled_from([20, 60, 280, 330, 900]), whole | damaged()), max_size=9))
+@four_and_two
+@given(data=st.data())
 def test_the_board_obeys_and_answers_whole_lines_only_and_forgets_them_after_300_ms(
-    sent: list[tuple[int, bytes]],
+    wheels: WheelMap, data: st.DataObject
 ) -> None:
-    mcu, model, now = FakeMcu(TRUE), Model(), 0
+    lines = WHOLE[wheels] | damaged(wheels)
+    waits = st.sampled_from([20, 60, 280, 330, 900])
+    sent = data.draw(st.lists(st.tuples(waits, lines), max_size=9))
+    mcu, model, now = FakeMcu(replace(TRUE, mcu=McuConfig(wheels=wheels))), Model(wheels), 0
     answers = 0
     for wait_ms, line in sent:
         cut = len(line) // 3  # in two pieces, it is one line
@@ -114,28 +133,36 @@ def test_the_board_obeys_and_answers_whole_lines_only_and_forgets_them_after_300
         mcu.receive(now * MS, line[cut:])
         model.hears(line, now + len(line) * 10e3 / 115200)
         answers += len(replies(mcu, (now + 15) * MS))  # on the wire, and 1 to 5 ms later
-        assert mcu.vehicle.set_points == pytest.approx(model.speeds)
+        assert mcu.vehicle.set_points == pytest.approx(model.at(now + 15))
         now += wait_ms
         answers += len(replies(mcu, now * MS))
-        if now > model.until_ms + 5:
-            model.speeds = STILL
-        assert mcu.vehicle.set_points == pytest.approx(model.speeds)
+        assert mcu.vehicle.set_points == pytest.approx(model.at(now))
     assert [line for _, line in mcu.heard] == [line for _, line in sent]
     assert mcu.valid_lines == answers == model.valid
 
 
-def test_the_board_starts_silent_and_then_reports_its_speeds_in_the_form_of_the_line() -> None:
-    mcu = FakeMcu(TRUE)
+@each(
+    ("wheels", "line", "slow", "zero"),
+    [
+        (FOUR, LINE, b"ap01.00,bp01.00,cp01.00,dp01.00\r\n", ZERO),
+        (TWO, b"lp12.50,rn08.75\r\n", b"lp01.00,rp01.00\r\n", b"lp00.00,rp00.00\r\n"),
+    ],
+)
+def test_the_board_starts_silent_and_then_reports_its_speeds_in_the_form_of_the_line(
+    wheels: WheelMap, line: bytes, slow: bytes, zero: bytes
+) -> None:
+    config = replace(TRUE, mcu=McuConfig(wheels=wheels))
+    mcu = FakeMcu(config)
     assert replies(mcu, 1000 * MS) == []
     assert mcu.next_ns() is None
-    assert [data for _, data in drive(mcu, 1000 * MS, 6)] == [ZERO] + [LINE] * 5
+    assert [data for _, data in drive(mcu, 1000 * MS, 6, line)] == [zero] + [line] * 5
     # Two reads of the encoders within 4 ms give the same figures.
-    mcu = FakeMcu(TRUE)
-    drive(mcu, 0, 4)
-    mcu.receive(50 * MS, b"ap01.00,bp01.00,cp01.00,dp01.00\r\n" + ZERO)
-    assert [data for _, data in replies(mcu, 80 * MS)] == [LINE] * 2
-    mcu.receive(80 * MS, ZERO)
-    assert replies(mcu, 100 * MS)[0][1] != LINE
+    mcu = FakeMcu(config)
+    drive(mcu, 0, 4, line)
+    mcu.receive(50 * MS, slow + zero)
+    assert [data for _, data in replies(mcu, 80 * MS)] == [line] * 2
+    mcu.receive(80 * MS, zero)
+    assert replies(mcu, 100 * MS)[0][1] != line
 
 
 def test_coarse_encoders_count_whole_steps_and_motors_lag() -> None:
@@ -235,13 +262,37 @@ def test_a_plain_or_a_checked_line_is_a_command_and_any_other_is_none(
         assert plain_only(line, "abcd") == prefix(line, "abcd") == command
 
 
+OF_TWO = b"lp12.50,rn08.75"
+BOTH = {0: 12.5, 1: -8.75}
+
+
+@each(
+    ("line", "command"),
+    [
+        *((OF_TWO + end, BoardCommand(BOTH)) for end in (b"\r\n", b"\n", b",\r\n")),
+        (closed(OF_TWO + b"#07S"), BoardCommand(BOTH, b"07", True)),
+        *((line, None) for line in (
+            OF_TWO + b"#07\r\n", closed(OF_TWO), closed(OF_TWO[:-1] + b"#07"), OF_TWO[:14],
+            OF_TWO[1:], b"rn08.75,lp12.50\r\n", b"lp12.50\r\n", LINE)),
+    ],
+)  # fmt: skip
+def test_a_board_of_two_motors_obeys_lines_with_their_two_values_only(
+    line: bytes, command: BoardCommand | None
+) -> None:
+    assert reference(line, "lr") == command
+    if b"#" not in line and b"*" not in line:
+        assert plain_only(line, "lr") == prefix(line, "lr") == command
+
+
 def test_replies_and_the_identity_line_are_written_as_the_firmware_writes_them() -> None:
     speeds = (12.5, -8.75, 0.0, -120.0)
     assert protocol.speeds_text("abcd", speeds, ",", False) == b"ap12.50,bn08.75,cp00.00,dn99.99"
     assert protocol.speeds_text("abcd", speeds, ", ", True) == b"ap12.50, bn8.75, cp0.00, dn99.99"
+    assert protocol.speeds_text("lr", speeds[:2], ",", False) == b"lp12.50,rn08.75"
     sample = (65536 + 4000, 1, -1, 32768, -32769)
     for counts, suffix in (((), b"#07"), (sample, b"#07@0FA00001FFFF80007FFF")):
         assert PLAIN + protocol.suffix(PLAIN, b"07", counts) + b"\r\n" == closed(PLAIN + suffix)
+    assert protocol.suffix(OF_TWO, b"07", sample[:3]) == closed(OF_TWO + b"#07@0FA00001FFFF")[15:-2]
     line = protocol.identity(3200, 300, sample=True)
     assert line == b"!acsard-mcu 1 counts=3200 watchdog_ms=300 check=1 sample=1\r\n"
     decoders = reference, prefix, plain_only

@@ -99,6 +99,13 @@ REFUSED: list[tuple[bytes, str]] = [
 ]
 """Line without its end -> the reason it is refused for."""
 
+
+def of_two(line: bytes) -> bytes:
+    """Return a line of `ACCEPTED` or `REFUSED` for a board that has only the motors a and b."""
+    values = [value for value in line.split(b",") if value.strip()[:1] not in (b"c", b"d")]
+    return b",".join(values)
+
+
 WRITTEN: list[tuple[float, bytes]] = [
     (0.0, b"p00.00"),
     (-0.0, b"p00.00"),
