@@ -14,7 +14,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from acsard.core.config.settings import CommandsConfig, Config, DriveConfig
+from acsard.core.config.settings import CommandsConfig, Config, DriveConfig, McuConfig
 from acsard.core.incoming.commands import Arrival, Receiver
 from acsard.core.messages.encodings import FORMATS, DecodeError, Format, encode
 from acsard.core.messages.refusals import MAX_COMMAND_BYTES
@@ -24,10 +24,13 @@ from acsard.core.motion.arbiter import Arbiter
 from acsard.core.motion.kinematics import Kinematics
 from acsard.core.values import Pose, Request, Twist, Verb
 from tests.each import each
+from tests.wheels import TWO
 
 KINEMATICS = Kinematics(DriveConfig())
 JOINTS = list(Config().joint_names)
 RECEIVER = Receiver(JOINTS, KINEMATICS)
+BOTH = list(Config(mcu=McuConfig(wheels=TWO)).joint_names)
+RECEIVER_OF_TWO = Receiver(BOTH, KINEMATICS)
 ARRIVED_NS = 77_000_000_000
 AXES = [(part, axis) for part in ("linear", "angular") for axis in "xyz"]
 NOT_FINITE = [math.nan, math.inf, -math.inf]
@@ -47,9 +50,11 @@ def written(body: dict[str, Any], form: Format) -> bytes:
     return encode(msgspec.convert(body, cls), form)
 
 
-def verdict(payload: bytes, key: str = "cmd/app", **changes: Any) -> Twist | str:
+def verdict(
+    payload: bytes, key: str = "cmd/app", receiver: Receiver = RECEIVER, **changes: Any
+) -> Twist | str:
     try:
-        return RECEIVER.command(arrival(payload, key, **changes)).twist
+        return receiver.command(arrival(payload, key, **changes)).twist
     except DecodeError as error:
         return error.reason
 
@@ -158,6 +163,36 @@ def test_wheel_commands_use_the_configured_joint_names() -> None:
     sample = arrival(msgspec.msgpack.encode(body), key="wheel_cmd/app")
     assert receiver.command(sample).twist.linear == pytest.approx(0.05)
     assert verdict(sample.payload, sample.key) == "wrong_wheels"
+
+
+def both(*velocity: float, names: list[str] | None = None, **others: Any) -> dict[str, Any]:
+    return joints(*velocity, names=names or BOTH, **others)
+
+
+@each(
+    ("body", "expected"),
+    [
+        (both(4.0, 2.0), Twist(0.15, 1 / 3)),
+        (both(2.0, 4.0, names=BOTH[::-1]), Twist(0.15, 1 / 3)),
+        (both(4.0, 9.0, 2.0, names=[BOTH[0], "arm", BOTH[1]]), Twist(0.15, 1 / 3)),
+        (both(-5.0, 5.0), Twist(0.0, -5 / 3)),
+        (both(1.0), "wrong_wheels"), (both(1.0, 2.0, 3.0), "wrong_wheels"),
+        (both(1.0, 1.0, names=BOTH[:1]), "wrong_wheels"),
+        (both(1.0, 1.0, names=[BOTH[0]] * 2), "wrong_wheels"),
+        (both(1.0, 1.0, 1.0, names=[*BOTH, BOTH[0]]), "wrong_wheels"),
+        (joints(1.0, 1.0, 1.0, 1.0), "wrong_wheels"),
+        (both(1.0, math.nan), "not_finite"), (both(1e308, 1e308), "not_finite"),
+        (both(1.0, 1.0, effort=[math.inf]), "not_finite"),
+    ],
+)  # fmt: skip
+def test_a_wheel_command_for_two_wheels_names_both(
+    body: dict[str, Any], expected: Twist | str
+) -> None:
+    found = verdict(written(body, "msgpack"), "wheel_cmd/app", receiver=RECEIVER_OF_TWO)
+    if isinstance(expected, str) or isinstance(found, str):
+        assert found == expected
+        return
+    assert (found.linear, found.angular) == pytest.approx((expected.linear, expected.angular))
 
 
 # A zero only counts as neutral if nothing else was meant.

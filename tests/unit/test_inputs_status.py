@@ -15,6 +15,7 @@ from acsard.core.link.checked_line import unseal
 from acsard.core.link.codec import Codec, FrameError
 from acsard.core.simulator import protocol
 from tests.each import each
+from tests.wheels import MAPS
 
 FULL = b"!status estop=ok bumpers=..X. driver=fault volts=24.31 amps=-1.20 charge=87% temp=-4.5"
 OK, PRESSED = b"!status estop=ok", b"!status estop=pressed"
@@ -90,16 +91,17 @@ def test_a_field_keeps_its_last_value_until_a_newer_line_has_it() -> None:
 # confusion
 
 
+@each("wheels", [*MAPS, WheelMap(left="+s", right="-t")])
 @each("line", [OK, PRESSED, FULL, sealed(OK), sealed(FULL)])
-def test_a_status_line_is_not_a_reply_in_any_dialect(line: bytes) -> None:
+def test_a_status_line_is_not_a_reply_in_any_dialect(line: bytes, wheels: WheelMap) -> None:
     for comma in (False, True):
         with pytest.raises(FrameError):
-            Codec(WheelMap(), comma).decode(line)
+            Codec(wheels, comma).decode(line)
     with pytest.raises(FrameError):
-        unseal(line, 4)
+        unseal(line, len(wheels.names))
     decoders = protocol.reference, protocol.plain_only, protocol.prefix
-    assert [decode(line, "abcd") for decode in decoders] == [None] * 3
-    assert protocol.latched(line + b",", "abcd").values == {}
+    assert [decode(line, wheels.letters) for decode in decoders] == [None] * 3
+    assert protocol.latched(line + b",", wheels.letters).values == {}
 
 
 @each("reply", REPLIES)

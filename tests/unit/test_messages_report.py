@@ -16,9 +16,11 @@ from acsard.core.config.settings import (
     Config,
     DriveConfig,
     LidarConfig,
+    McuConfig,
     OdometryConfig,
     RatesConfig,
     RobotConfig,
+    WheelMap,
 )
 from acsard.core.messages.certificate_expiry import DAY_NS, expiry
 from acsard.core.messages.keys_and_roles import BEAT, PUBLISHED
@@ -48,12 +50,14 @@ from acsard.core.messages.schema import (
 from acsard.core.messages.snapshot import Snapshot
 from acsard.core.motion.gyro import STATUS_TEXTS
 from acsard.core.values import (
+    WHEELS,
     BatteryStatus,
     Instant,
 )
 from tests.each import each
 from tests.stepped import Outputs
 from tests.unit.examples import ESTIMATE, OUTPUTS, SNAPSHOT, START, at, changed, due, later
+from tests.wheels import FOUR, TWO
 
 ALL = {topic.key for topic in PUBLISHED if not topic.simulated} - {BEAT}
 """Keys that a report publishes.
@@ -98,8 +102,17 @@ STAMP, OF_STEP = Time(1_700_000_003, 250_000_001), Time(1_700_000_003, 254_000_0
 HALF = Quaternion(0.0, 0.0, math.sin(0.25), math.cos(0.25))
 
 
-def test_the_messages_of_a_sample_have_its_stamp_its_values_and_the_configured_frames() -> None:
-    messages = published()
+@each(
+    ("wheels", "joints"),
+    [
+        (FOUR, [f"{name}_wheel_joint" for name in WHEELS]),
+        (TWO, ["right_wheel_joint", "left_wheel_joint"]),
+    ],
+)
+def test_the_messages_of_a_sample_have_its_stamp_its_values_and_the_configured_frames(
+    wheels: WheelMap, joints: list[str]
+) -> None:
+    messages = published(config=replace(CONFIG, mcu=McuConfig(wheels=wheels)))
     # fmt: off
     pose = [
         0.11, 0.12, 0.0, 0.0, 0.0, 0.16,
@@ -120,8 +133,8 @@ def test_the_messages_of_a_sample_have_its_stamp_its_values_and_the_configured_f
     turned = TransformStamped(header, "r7/base", Transform(place, HALF))
     assert messages["tf"] == TFMessage([turned])
     assert messages["wheel_states"] == JointState(
-        Header(STAMP, ""), list(CONFIG.joint_names), [10.0, 20.0, 30.0, 40.0],
-        [1.0, 2.0, 3.0, 4.0], [],
+        Header(STAMP, ""), joints, [10.0, 20.0, 30.0, 40.0][: len(joints)],
+        [1.0, 2.0, 3.0, 4.0][: len(joints)], [],
     )  # fmt: skip
 
 

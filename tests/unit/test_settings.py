@@ -34,6 +34,7 @@ from acsard.core.config.settings import (
     McuConfig,
     Source,
     WebConfig,
+    WheelMap,
 )
 from acsard.core.config.validation import build
 from acsard.core.config.wire_time import highest_rate, wire_ns, wire_use
@@ -42,6 +43,7 @@ from acsard.web.listen import parse_listen
 from tests.each import each
 from tests.unit.keys import KEYS, Key
 from tests.vectors.lines import WIRE
+from tests.wheels import TWO
 
 PAGE = Path(__file__).parent / "words" / "settings.txt"
 REFERENCE = Path(__file__).parents[2] / "acsard.toml"
@@ -119,6 +121,17 @@ def test_the_reference_file_has_every_key_and_no_other_and_explains_each_table()
 def test_a_name_is_letters_digits_underscore_and_minus(name: str) -> None:
     good = name in ("a", "A-z_0", "x" * 32)
     assert (build(Source, {"name": name, "priority": 1}, "t", []) is not None) == good
+
+
+@each("letter", [chr(code) for code in range(128)])
+@each("sign", ["+", "-"])
+def test_a_motor_is_a_sign_and_a_letter_that_is_no_sign_of_the_line(letter: str, sign: str) -> None:
+    good = letter in set("abcdefghijklmnopqrstuvwxyz") - {"n", "p"}
+    for name in ("front_left", "left"):
+        assert (build(WheelMap, {name: sign + letter}, "t", []) is not None) == good
+        assert build(WheelMap, {name: letter}, "t", []) is None
+        assert build(WheelMap, {name: sign + letter + "\n"}, "t", []) is None
+    assert build(WheelMap, {"front_left": ""}, "t", []) is None
 
 
 @each("frame", ["robot1/front_left", "", "/odom", "a b", "x" * 65, "é", "a-b"])
@@ -233,6 +246,10 @@ def test_the_time_of_a_line_and_the_highest_rate_are_those_of_the_table(
         (McuConfig(link_check="on"), 41, (18, 37, 74, 100, 100)),
         (McuConfig(link_check="on", trailing_comma=True), 42, (18, 36, 73, 100, 100)),
         (McuConfig(link_check="on", encoder_counts=3200), 62, (12, 24, 49, 74, 100)),
+        (McuConfig(wheels=TWO), 17, (45, 90, 100, 100, 100)),
+        (McuConfig(wheels=TWO, trailing_comma=True), 18, (42, 85, 100, 100, 100)),
+        (McuConfig(wheels=TWO, link_check="on"), 25, (30, 61, 100, 100, 100)),
+        (McuConfig(wheels=TWO, link_check="on", encoder_counts=3200), 38, (20, 40, 80, 100, 100)),
     ],
 )  # fmt: skip
 def test_an_automatic_rate_uses_at_most_80_percent_of_the_wire_for_the_longest_line(

@@ -70,7 +70,8 @@ def test_every_live_setting_is_a_key_and_every_source_has_a_live_timeout() -> No
 
 @each(
     "key",
-    ["mcu.port", "drive.wheel_radius", "feedback.response_time", "commands.neutral_first",
+    ["mcu.port", "mcu.wheels.left", "mcu.wheels.rear_left", "drive.wheel_radius",
+     "feedback.response_time", "commands.neutral_first",
      "commands.sources.nav.priority", "bus.listen", "access.maintainers", "robot.id",
      "odometry.gyro", "odometry.distance_scale_std", "commands.sources.nav"],
 )  # fmt: skip
@@ -144,6 +145,8 @@ def test_a_change_is_judged_as_the_file(key: str, value: object, beside: dict[st
         ("use_sim_time", True, "always uses the clock of its host"),
         ("use_sim_time", False, "leave use_sim_time false in the nodes"),
         ("mcu.port", "/dev/x", "only when the daemon starts: change it in acsard.toml"),
+        ("mcu.wheels.left", "+l", "only when the daemon starts: change it in acsard.toml"),
+        ("mcu.wheels.lefd", "+l", "did you mean mcu.wheels.left?"),
     ],
 )
 def test_a_setting_that_cannot_be_set_has_a_remedy(key: str, value: object, words: str) -> None:
