@@ -12,11 +12,12 @@ from typing import Literal
 
 from msgspec import Struct
 
-from acsard.core.config.settings import DriveConfig, FeedbackConfig, LimitsConfig
+from acsard.core.config.settings import DriveConfig, FeedbackConfig, LimitsConfig, WheelMap
 from acsard.core.motion.kinematics import Kinematics
 from acsard.core.motion.limits import follow
 from acsard.core.motion.wheels import Wheels, count_angle, new_wheels
-from acsard.core.values import WHEELS, Motion, Twist, WheelSpeeds
+from acsard.core.values import WHEELS, Motion, Twist, Wheels4, WheelSpeeds
+from tests.wheels import FOUR
 
 Kind = Literal["reversed", "runaway", "dead", "stuck", "swapped", "too fast", "too slow"]
 
@@ -88,21 +89,23 @@ class Findings(Struct):
 class Bench:
     """One robot with its `Wheels`, step by step. On a rough ground no step is like the last one."""
 
-    def __init__(self, robot: Robot, dice: random.Random, rough: bool = True) -> None:
-        self.robot, self.dice, self.rough = robot, dice, rough
+    def __init__(
+        self, robot: Robot, dice: random.Random, rough: bool = True, wheels: WheelMap = FOUR
+    ) -> None:
+        self.robot, self.dice, self.rough, self.driven = robot, dice, rough, len(wheels.names)
         self.kinematics = Kinematics(robot.drive)
         self.limits = robot.limits
         self.feedback = FeedbackConfig(response_time=robot.response_time)
         self.count = count_angle(robot.counts if robot.declared else 0)
         self.unit = math.tau / robot.counts
-        self.wheels: Wheels = new_wheels(4)
+        self.wheels: Wheels = new_wheels(self.driven)
         self.motion = Motion()
         self.now = 0.0
-        self.speeds = [0.0] * 4
-        self.angles = [dice.uniform(0.0, self.unit) for _ in WHEELS]
+        self.speeds = [0.0] * self.driven
+        self.angles = [dice.uniform(0.0, self.unit) for _ in self.speeds]
         self.counted = [math.floor(angle / self.unit) for angle in self.angles]
-        self.lags = [robot.lag * dice.uniform(0.9, 1.1) for _ in WHEELS]
-        self.sizes = [dice.uniform(0.985, 1.015) for _ in WHEELS]
+        self.lags = [robot.lag * dice.uniform(0.9, 1.1) for _ in self.speeds]
+        self.sizes = [dice.uniform(0.985, 1.015) for _ in self.speeds]
         self.gain = 1.0  # slopes and bumps
         self.hand: list[float] | None = None  # rad/s of each wheel that a person turns
         self.drives: dict[int, float] = {}  # factor of the command of a motor
@@ -120,10 +123,10 @@ class Bench:
         self.now += dt
         self.motion = follow(self.motion, wished, dt, self.limits, self.kinematics, self.cap)
         commanded = self.kinematics.wheel_speeds(self.motion.twist)
-        goals = list(commanded.as_tuple())
+        goals = list(commanded.as_tuple()[: self.driven])
         for i, j in self.swaps:
             goals[i], goals[j] = goals[j], goals[i]
-        turned, speeds = [0.0] * 4, [0.0] * 4
+        turned, speeds = [0.0] * self.driven, [0.0] * self.driven
         for i, goal in enumerate(goals):
             lag, goal = self.lags[i], goal * self.gain * self.sizes[i] * self.drives.get(i, 1.0)
             if self.hand is not None:
@@ -140,14 +143,11 @@ class Bench:
             counts = 0 if i in self.dead else counts * self.signs.get(i, 1)
             speeds[i] = self.frozen.get(i, round(counts * self.unit / dt, 2))
             turned[i] = speeds[i] * dt
-        front_right, front_left, rear_left, rear_right = speeds
-        reported = WheelSpeeds(front_right, front_left, rear_left, rear_right)
-        first, second, third, fourth = turned
+        reported = WheelSpeeds(*of_four(speeds))
         wheels, said = self.wheels, self.said
         wheels.commanded = commanded
         wheels.add(
-            (first, second, third, fourth), reported, dt, None, self.feedback, self.kinematics,
-            self.count,
+            of_four(turned), reported, dt, None, self.feedback, self.kinematics, self.count,
         )  # fmt: skip
         for event in wheels.events:
             said.first.setdefault(event.code or event.kind, self.now)
@@ -162,6 +162,13 @@ class Bench:
             self.step(wished)
 
 
+def of_four(values: list[float]) -> Wheels4:
+    """Return the values of four wheels; of two driven ones, the rear ones do as the front ones."""
+    right, left, *rear = values
+    rear_left, rear_right = rear or (left, right)
+    return right, left, rear_left, rear_right
+
+
 def twist(dice: random.Random, made: Robot) -> Twist:
     kind, speed = dice.random(), made.speed
     turn = 2.0 * speed / made.track * dice.uniform(-1.0, 1.0)
@@ -174,11 +181,11 @@ def twist(dice: random.Random, made: Robot) -> Twist:
     return Twist(speed * dice.uniform(-1.0, 1.0), turn * dice.uniform(0.0, 1.0))
 
 
-def sound(seed: int, seconds: float) -> tuple[Robot, Findings]:
+def sound(seed: int, seconds: float, wheels: WheelMap) -> tuple[Robot, Findings]:
     """Drive a sound robot at random: slopes, bumps, reversals, caps, and pushes while it rests."""
     dice = random.Random(seed)
     made = robot(dice)
-    bench = Bench(made, dice)
+    bench = Bench(made, dice, wheels=wheels)
     while bench.now < seconds:
         slope = dice.uniform(0.75, 1.15)
         bench.cap = made.speed * dice.uniform(0.2, 1.0) if dice.random() < 0.2 else math.inf
@@ -201,11 +208,11 @@ def sound(seed: int, seconds: float) -> tuple[Robot, Findings]:
     return made, bench.said
 
 
-def restless(seed: int, seconds: float) -> tuple[Robot, Findings]:
+def restless(seed: int, seconds: float, wheels: WheelMap) -> tuple[Robot, Findings]:
     """Drive a sound robot whose stick moves to and fro between two wishes, on slopes."""
     dice = random.Random(seed)
     made = robot(dice)
-    bench = Bench(made, dice)
+    bench = Bench(made, dice, wheels=wheels)
     while bench.now < seconds:
         one, other = twist(dice, made), twist(dice, made)
         if dice.random() < 0.5:
@@ -229,20 +236,24 @@ class Case(Struct, frozen=True):
     late: float  # rad beyond the bound that the faulty wheels have rolled when it was found
 
 
-GROUPS: tuple[tuple[int, ...], ...] = (0,), (1,), (2,), (3,), (0, 3), (1, 2), (0, 1, 2, 3)
+GROUPS: dict[int, tuple[tuple[int, ...], ...]] = {
+    4: ((0,), (1,), (2,), (3,), (0, 3), (1, 2), (0, 1, 2, 3)),
+    2: ((0,), (1,), (0, 1)),
+}
 
 
-def faulty(kind: Kind, seed: int) -> Case:
+def faulty(kind: Kind, seed: int, wheels: WheelMap) -> Case:
     """Drive a robot that has a fault, until it is found or the bound has passed by far."""
     dice = random.Random(f"{kind} {seed}")
     made = robot(dice, sound=False)
-    bench = Bench(made, dice)
-    group = GROUPS[seed % len(GROUPS)]
+    bench = Bench(made, dice, wheels=wheels)
+    groups = GROUPS[bench.driven]
+    group = groups[seed % len(groups)]
     speed = made.speed * dice.choice((-1, 1))
     arc = Twist(speed, dice.choice((0.0, dice.uniform(-0.5, 0.5) * speed / made.track)))
     wished = arc
     if kind == "swapped":
-        pairs = dice.choice([[(0, 1)], [(3, 2)], [(0, 1), (3, 2)]])
+        pairs = dice.choice([[(0, 1)], [(3, 2)], [(0, 1), (3, 2)]][: bench.driven - 1])
         bench.swaps = pairs
         group = tuple(i for pair in pairs for i in pair)
         turn = dice.choice((-1, 1)) * dice.uniform(0.6, 2.0) * abs(speed) / made.track

@@ -6,7 +6,7 @@ import math
 
 import pytest
 
-from acsard.core.config.settings import DriveConfig, FeedbackConfig
+from acsard.core.config.settings import DriveConfig, FeedbackConfig, WheelMap
 from acsard.core.link.feedback import Line
 from acsard.core.motion.gyro import Turn
 from acsard.core.motion.kinematics import Kinematics
@@ -15,6 +15,7 @@ from acsard.core.values import WHEELS, WheelSpeeds
 from tests.each import each
 from tests.unit.odometer import Odometer
 from tests.unit.test_pose import AT, Says
+from tests.wheels import FOUR, MAPS
 
 PERIOD = 0.01
 
@@ -33,10 +34,10 @@ TEN = speeds_of(10.0)
 class Bench:
     """The verdicts on wheels, line by line. A single speed is that of all four wheels."""
 
-    def __init__(self, counts: int = 3200, encoders: bool = True) -> None:
+    def __init__(self, counts: int = 3200, encoders: bool = True, wheels: WheelMap = FOUR) -> None:
         self.kinematics, self.count = Kinematics(DriveConfig()), count_angle(counts)
         self.feedback = FeedbackConfig(encoders=encoders)
-        self.wheels = new_wheels(4)
+        self.wheels = new_wheels(len(wheels.names))
         self.events: list[str] = []
         self.faults: list[str] = []
         self.missed: list[tuple[str, float]] = []  # sides that may have turned, and how far, rad
@@ -51,6 +52,7 @@ class Bench:
         late: bool = False,
         noise: float = 0.0,
         each: float = PERIOD,
+        until_fault: bool = False,
     ) -> float:
         """Feed lines for this time. Return when a wheel was left out, s, or inf.
 
@@ -72,6 +74,8 @@ class Bench:
             self.pushes += bool(wheels.pushed)
             if wheels.fault is not None:
                 self.faults.append(wheels.fault.code)
+                if until_fault:
+                    break
             possible = wheels.possible_motion((0.0, 0.0, 0.0, 0.0))
             self.missed += [(side, angles[0]) for side, angles in possible]
         return time_s
@@ -99,17 +103,23 @@ class Bench:
 # faults, warnings and reports
 
 
+@each("wheels", MAPS)
 @each("keeps", [0.4, 0.8, 1.6])
-def test_wheels_that_keep_their_last_speed_after_a_stop_roll_on(keeps: float) -> None:
-    bench = Bench().driven(5.0).stopped(5.0, keeps)
+def test_wheels_that_keep_their_last_speed_after_a_stop_roll_on(
+    keeps: float, wheels: WheelMap
+) -> None:
+    bench = Bench(wheels=wheels).driven(5.0).stopped(5.0, keeps)
     assert set(bench.faults) == {"wheel_runaway"}
 
 
+@each("wheels", MAPS)
 @each("counts", [16, 3200])
 @each("speed", [0.8, 1.4, 10.0])
-def test_a_robot_faster_than_its_limiter_for_a_second_is_a_fault(speed: float, counts: int) -> None:
+def test_a_robot_faster_than_its_limiter_for_a_second_is_a_fault(
+    speed: float, counts: int, wheels: WheelMap
+) -> None:
     """It is beyond a fifth more by 0.3 rad and 1.5 counts, too."""
-    bench, fast = Bench(counts).driven(speed), 1.35 * speed
+    bench, fast = Bench(counts, wheels=wheels).driven(speed), 1.35 * speed
     beyond_s = max(0.3, 1.5 * count_angle(counts)) / (fast - 1.2 * speed)
     bench.run(fast, speed, 0.9 * max(1.0, beyond_s))
     assert bench.faults == []
@@ -117,25 +127,55 @@ def test_a_robot_faster_than_its_limiter_for_a_second_is_a_fault(speed: float, c
     assert bench.faults[0] == "wheel_too_fast"
 
 
-def test_blocked_wheels_are_a_warning_until_they_turn() -> None:
-    bench = Bench()
+@each("wheels", MAPS)
+def test_blocked_wheels_are_a_warning_until_they_turn(wheels: WheelMap) -> None:
+    bench = Bench(wheels=wheels)
     bench.run(0.0, 10.0, 1.0)
-    assert (bench.faults, bench.events) == ([], ["wheel_blocked"] * 4)
-    assert "front_left wheel is blocked, or has no" in bench.text
+    assert (bench.faults, bench.events) == ([], ["wheel_blocked"] * len(wheels.names))
+    texts = bench.text.split("; ")
+    assert [text.partition(" wheel is blocked, or has no")[0] for text in texts] == [*wheels.names]
     bench.run(10.0, 10.0, 1.5)
-    assert bench.text == ""
+    assert (bench.text, bench.events[len(texts) :]) == ("", ["again"] * len(texts))
 
 
-def test_wheels_that_rested_and_are_then_turned_are_reported_and_never_a_fault() -> None:
-    bench = Bench()
+@each("wheels", MAPS)
+def test_wheels_that_rested_and_are_then_turned_are_reported_and_never_a_fault(
+    wheels: WheelMap,
+) -> None:
+    bench = Bench(wheels=wheels)
     bench.run(0.0, 0.0, 1.0)
     bench.run(2.0, 0.0, 3.0, noise=0.1)
     assert (bench.faults, bench.pushes >= 2) == ([], True)
-    bench = Bench().driven()  # also after a press, in which nothing proves a fault
+    bench = Bench(wheels=wheels).driven()  # also after a press, in which nothing proves a fault
     bench.run(5.0, None, 1.0)
     bench.run(0.0, None, 1.0)
     bench.run(3.0, 0.0, 2.0, noise=0.1)
     assert (bench.faults, bench.pushes >= 1) == ([], True)
+
+
+@each("wheels", MAPS)
+@each(
+    ("speeds", "commands", "code", "words"),
+    [
+        ((10.0, -10.0), (10.0, 10.0), "wheel_reversed", "left wheel"),
+        ((10.0, 10.0), (0.0, 10.0), "wheel_runaway", "right wheel"),
+        ((-10.0, 10.0), (10.0, -10.0), "wheels_swapped", "right and left wheels"),
+    ],
+)
+def test_a_fault_names_its_wheels_and_is_found_once(
+    speeds: tuple[float, float], commands: tuple[float, float], code: str, words: str,
+    wheels: WheelMap,
+) -> None:  # fmt: skip
+    """Both wheels of a side do the same, so that neither outvotes the other."""
+    bench, (right, left), (of_right, of_left) = Bench(wheels=wheels).driven(), speeds, commands
+    told = WheelSpeeds(of_right, of_left, of_left, of_right)
+    bench.run(WheelSpeeds(right, left, left, right), told, 3.0, until_fault=True)
+    fault = bench.wheels.fault
+    assert fault is not None
+    assert (fault.code, bench.faults) == (code, [code])
+    assert fault.text.replace("front_", "").replace("rear_", "").startswith(words)
+    assert ("front" in fault.text or "rear" in fault.text) is (wheels is FOUR)
+    assert fault.part in (*wheels.names, " and ".join(wheels.names[:2]), "rear_right and rear_left")
 
 
 def test_what_sound_robots_do_is_no_fault() -> None:
@@ -163,8 +203,9 @@ def test_what_sound_robots_do_is_no_fault() -> None:
 # a turn that both wheels of a side may have missed
 
 
-def test_both_wheels_of_a_side_that_report_no_turn_may_have_turned() -> None:
-    bench = Bench().driven()
+@each("wheels", MAPS)
+def test_all_wheels_of_a_side_that_report_no_turn_may_have_turned(wheels: WheelMap) -> None:
+    bench = Bench(wheels=wheels).driven()
     bench.run(WheelSpeeds(0.0, 10.0, 10.0, 0.0), 10.0, 1.0)
     assert {side for side, _ in bench.missed} == {"right"}
     assert sum(angle for _, angle in bench.missed) == pytest.approx(10.0, rel=0.1)

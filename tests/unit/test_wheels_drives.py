@@ -11,34 +11,37 @@ import random
 
 import pytest
 
-from acsard.core.config.settings import FeedbackConfig
+from acsard.core.config.settings import FeedbackConfig, WheelMap
 from acsard.core.values import WHEELS, Twist
 from tests.unit.rolling import RIGHT, Bench, Kind, Robot, faulty, restless, sound, twist
+from tests.wheels import four_and_two
 
 SOAK = [pytest.mark.soak, pytest.mark.timeout(3600)]
 
 
 @pytest.mark.parametrize("count", [14, pytest.param(200, marks=SOAK)])
 @pytest.mark.parametrize("kind", list(RIGHT))
-def test_every_fault_is_found_within_its_bound(kind: Kind, count: int) -> None:
+@four_and_two
+def test_every_fault_is_found_within_its_bound(kind: Kind, count: int, wheels: WheelMap) -> None:
     """After the ramp and three response times, the wheels roll 1 rad and 3 counts at most.
 
     A robot of 16 counts and a coincidence of its speed with whole counts may take longer: one in a
     hundred.
     """
-    cases = [faulty(kind, seed) for seed in range(count)]
-    assert not [seed for seed, case in enumerate(cases) if not case.found]
+    cases = [faulty(kind, seed, wheels) for seed in range(1, 1 + count)]
+    assert not [seed for seed, case in enumerate(cases, 1) if not case.found]
     late = sorted(case.late for case in cases if case.late > 0.05)
     print(f"\n{kind}: {len(late)} of {count} are late {late[-3:]}")
     assert len(late) <= count // 100
 
 
 @pytest.mark.parametrize(("robots", "seconds"), [(6, 60.0), pytest.param(1200, 300.0, marks=SOAK)])
-def test_sound_robots_latch_no_fault(robots: int, seconds: float) -> None:
+@four_and_two
+def test_sound_robots_latch_no_fault(robots: int, seconds: float, wheels: WheelMap) -> None:
     """They respond in 0.05 to 1.5 s, on slopes and bumps, and are pushed while they rest."""
     pushes = 0
     for seed in range(robots):
-        made, said = sound(seed, seconds)
+        made, said = sound(seed, seconds, wheels)
         assert (said.faults, said.excluded) == ([], set()), (seed, made, said)
         pushes += said.pushes
     assert pushes
@@ -47,9 +50,12 @@ def test_sound_robots_latch_no_fault(robots: int, seconds: float) -> None:
 @pytest.mark.parametrize(
     "seed", [31, *(pytest.param(seed, marks=SOAK) for seed in range(100, 200))]
 )
-def test_sound_robots_whose_stick_moves_to_and_fro_latch_no_fault(seed: int) -> None:
+@four_and_two
+def test_sound_robots_whose_stick_moves_to_and_fro_latch_no_fault(
+    seed: int, wheels: WheelMap
+) -> None:
     """The motors of robot 31 are quicker than configured, so they turn before they are due."""
-    made, said = restless(seed, 10.0 if seed == 31 else 60.0)
+    made, said = restless(seed, 10.0 if seed == 31 else 60.0, wheels)
     assert said.faults == [], made
 
 
