@@ -8,13 +8,14 @@ import random
 import pytest
 
 from acsard.core.config.contradictions import MOST_ASKED_HZ
-from acsard.core.config.settings import Config, ControlConfig, McuConfig, SimConfig
+from acsard.core.config.settings import Config, ControlConfig, McuConfig, SimConfig, WheelMap
 from tests.scenarios.world import World
+from tests.wheels import four_and_two
 
 
-def driven(counts: int) -> World:
+def driven(counts: int, wheels: WheelMap) -> World:
     """Return a robot with a free-running board that has driven at random and stopped."""
-    mcu = McuConfig(reply_period=0.01)
+    mcu = McuConfig(reply_period=0.01, wheels=wheels)
     world, dice = World(Config(mcu=mcu, sim=SimConfig(encoder_counts=counts))), random.Random(4)
     with world.mcu.fault("free_running", 0.01):
         world.run(0.5)
@@ -31,12 +32,15 @@ def off(world: World) -> float:
     return math.hypot(state.x - true.x, state.y - true.y)
 
 
+@four_and_two
 @pytest.mark.parametrize(
     "counts", [20, *(pytest.param(counts, marks=pytest.mark.slow) for counts in (16, 96, 400))]
 )
-def test_a_robot_that_reports_by_its_own_clock_is_where_its_lines_say(counts: int) -> None:
-    world = driven(counts)
-    assert world.state.encoder_counts == [0] * 4
+def test_a_robot_that_reports_by_its_own_clock_is_where_its_lines_say(
+    counts: int, wheels: WheelMap
+) -> None:
+    world = driven(counts, wheels)
+    assert world.state.encoder_counts == [0] * len(wheels.names)
     assert ("coarse_encoder_lines" in world.state.counters) is (counts < 400)
     assert "line_implausible" not in world.state.counters
     assert not [event for event in world.events if event.name in ("fault", "lines_implausible")]

@@ -10,10 +10,14 @@ import pytest
 from acsard.core.config.settings import Config, McuConfig, SimConfig, WheelMap
 from acsard.core.values import Received
 from tests.scenarios.world import World
+from tests.wheels import FOUR, TWO, four_and_two
 
 
-def world(counts: int, link_check: str = "off", configured: int | None = None) -> World:
+def world(
+    counts: int, link_check: str = "off", configured: int | None = None, wheels: WheelMap = FOUR
+) -> World:
     mcu = McuConfig(
+        wheels=wheels,
         link_check="on" if link_check == "on" else "off",
         encoder_counts=counts if configured is None else configured,
     )
@@ -36,8 +40,11 @@ def sigmas(world: World) -> float:
 
 @pytest.mark.variations(3)
 @pytest.mark.parametrize("wrong", [4.0, 0.25, 1.5])
-def test_with_wrong_counts_the_pose_uses_the_speeds_and_a_warning_says_so(wrong: float) -> None:
-    robot = world(3200, "on", round(3200 * wrong))
+@four_and_two
+def test_with_wrong_counts_the_pose_uses_the_speeds_and_a_warning_says_so(
+    wrong: float, wheels: WheelMap
+) -> None:
+    robot = world(3200, "on", round(3200 * wrong), wheels)
     drive(robot)
     robot.hold(0.0, 0.0, 1.0)
     assert robot.state.pose_doubt == "encoder_counts_wrong"
@@ -45,11 +52,12 @@ def test_with_wrong_counts_the_pose_uses_the_speeds_and_a_warning_says_so(wrong:
     assert sigmas(robot) < 3.0
 
 
+@four_and_two
 @pytest.mark.parametrize(("counts", "configured"), [(64, 16), (24, 96), (64, 32)])
 def test_what_wrong_counts_moved_before_they_were_noticed_is_a_doubt(
-    counts: int, configured: int
+    counts: int, configured: int, wheels: WheelMap
 ) -> None:
-    robot = world(counts, "on", configured)
+    robot = world(counts, "on", configured, wheels)
     robot.run(0.5)
     robot.drive(0.5, 0.0, 1.5)
     robot.hold(0.0, 0.0, 1.0)
@@ -91,10 +99,11 @@ def test_right_counts_are_used_from_the_first_second_of_driving() -> None:
 @pytest.mark.variations(4)
 @pytest.mark.parametrize("counts", [16, 96])
 @pytest.mark.parametrize("configured", [True, False])
+@four_and_two
 def test_a_coarse_encoder_on_a_plain_link_that_loses_replies_advises_the_checked_link(
-    counts: int, configured: bool
+    counts: int, configured: bool, wheels: WheelMap
 ) -> None:
-    robot = world(counts, configured=None if configured else 0)
+    robot = world(counts, configured=None if configured else 0, wheels=wheels)
     with robot.mcu.fault("lost_replies", 20):
         drive(robot)
     assert robot.state.pose_doubt == "coarse_encoder"
@@ -110,14 +119,14 @@ def test_a_coarse_encoder_behind_an_adapter_of_16_ms_advises_the_checked_link(co
     assert robot.state.pose_doubt == "coarse_encoder"
 
 
-@pytest.mark.parametrize("link_check", ["off", "on"])
+@pytest.mark.parametrize(("link_check", "wheels"), [("off", FOUR), ("on", FOUR), ("off", TWO)])
 @pytest.mark.parametrize(
     ("counts", "code"), [(16, "encoder_counts_missing"), (96, "encoder_counts_missing"), (400, "")]
 )
 def test_coarse_encoders_whose_counts_are_not_declared_advise_to_declare_them(
-    counts: int, code: str, link_check: str
+    counts: int, code: str, link_check: str, wheels: WheelMap
 ) -> None:
-    robot = world(counts, link_check, 0)
+    robot = world(counts, link_check, 0, wheels)
     drive(robot)
     assert robot.state.pose_doubt == code
     doubts = [event.text for event in robot.events if event.name == "pose_doubtful"]
@@ -144,10 +153,11 @@ def nothing(robot: World) -> None:
         (16, "on", lost), (16, "on", held),
     ],
 )  # fmt: skip
+@four_and_two
 def test_a_sound_link_or_a_fine_encoder_gets_no_advice(
-    counts: int, link_check: str, fault: Callable[[World], None]
+    counts: int, link_check: str, fault: Callable[[World], None], wheels: WheelMap
 ) -> None:
-    robot = world(counts, link_check)
+    robot = world(counts, link_check, wheels=wheels)
     fault(robot)
     robot.run(0.5)
     for number in range(12):

@@ -12,11 +12,12 @@ import random
 
 import pytest
 
-from acsard.core.config.settings import Config, McuConfig, SimConfig
+from acsard.core.config.settings import Config, McuConfig, SimConfig, WheelMap
 from acsard.core.values import Pose
 from tests.scenarios.world import World
 from tests.stepped import Outputs
 from tests.unit.odometer import arc
+from tests.wheels import four_and_two
 
 
 class Square:
@@ -25,10 +26,11 @@ class Square:
     It computes a second pose from the raw encoder counts.
     """
 
-    def __init__(self, link: str, counts: int, stalls: bool, seed: int) -> None:
+    def __init__(self, link: str, counts: int, stalls: bool, seed: int, wheels: WheelMap) -> None:
         mcu = McuConfig(
             link_check="off" if link == "plain" else "on",
             encoder_counts=counts,
+            wheels=wheels,
         )
         self.world = world = World(Config(sim=SimConfig(encoder_counts=counts), mcu=mcu))
         self._counts, self._pose, self._before = counts, Pose(), [0] * 4
@@ -84,8 +86,11 @@ class Square:
 @pytest.mark.parametrize("stalls", [True, False], ids=["stalls", ""])
 @pytest.mark.parametrize("counts", [16, 20, 96, 400, 1000, 3200])
 @pytest.mark.parametrize("link", ["plain", "checked", "checked with counts"])
-def test_a_square_ends_where_the_raw_counter_says(link: str, counts: int, stalls: bool) -> None:
-    square = Square(link, counts, stalls, 1)
+@four_and_two
+def test_a_square_ends_where_the_raw_counter_says(
+    link: str, counts: int, stalls: bool, wheels: WheelMap
+) -> None:
+    square = Square(link, counts, stalls, 1, wheels)
     far, turned, raw_far, raw_turned = square.errors()
     print(
         f"{link}, {counts} counts, {'stalls' if stalls else 'no stalls'}: "
@@ -99,10 +104,13 @@ def test_a_square_ends_where_the_raw_counter_says(link: str, counts: int, stalls
     assert far <= 1.05 * raw_far + (0.03 if fine else 0.005)
 
 
-def test_state_reports_the_configured_counts_if_the_speeds_agree_with_them() -> None:
-    mcu = McuConfig(encoder_counts=16)
+@four_and_two
+def test_state_reports_the_configured_counts_if_the_speeds_agree_with_them(
+    wheels: WheelMap,
+) -> None:
+    mcu = McuConfig(encoder_counts=16, wheels=wheels)
     world = World(Config(sim=SimConfig(encoder_counts=16), mcu=mcu))
     world.run(0.5)
     world.drive(0.5, 0.3, 2.0)
-    assert world.state.encoder_counts == [16] * 4
+    assert world.state.encoder_counts == [16] * len(wheels.names)
     assert "coarse_encoder_lines" not in world.state.counters

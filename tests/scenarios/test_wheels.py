@@ -15,6 +15,7 @@ from acsard.core.config.settings import (
     LimitsConfig,
     McuConfig,
     SimConfig,
+    WheelMap,
 )
 from acsard.core.motion.sides import FAULT_RESPONSES
 from acsard.core.motion.wheels import (
@@ -24,13 +25,19 @@ from acsard.core.motion.wheels import (
     count_angle,
 )
 from acsard.core.simulator.protocol import speeds_text
-from acsard.core.values import NS_PER_S, WHEELS, Received
+from acsard.core.values import NS_PER_S, Received
 from tests.scenarios.world import World
+from tests.wheels import FOUR, TWO, four_and_two
 
 
 @pytest.fixture
-def world() -> World:
-    world = World()
+def wheels() -> WheelMap:
+    return FOUR
+
+
+@pytest.fixture
+def world(wheels: WheelMap) -> World:
+    world = World(Config(mcu=McuConfig(wheels=wheels)))
     world.run(0.2)
     return world
 
@@ -38,7 +45,9 @@ def world() -> World:
 def damage(world: World, every: int, speeds: tuple[float, ...]) -> list[int]:
     """Replace each so-many-th line by one with these speeds; return a list of their number."""
     feed, seen, damaged = world.port.feed, 0, [0]
-    text = speeds_text("abcd", speeds, world.mcu.switches.separator, False) + b"\r\n"
+    letters = world.mcu.letters
+    text = speeds_text(letters, speeds[: len(letters)], world.mcu.switches.separator, False)
+    text += b"\r\n"
 
     def fed(received: Received) -> None:
         nonlocal seen
@@ -58,20 +67,27 @@ def stopped(world: World) -> bool:
     return world.mcu.vehicle.set_points == [0.0] * 4
 
 
-@pytest.mark.variations(6)
-@pytest.mark.parametrize("wheel", range(4))
+@pytest.mark.variations(4)
+@pytest.mark.parametrize(
+    ("wheels", "wheel"), [(wheels, n) for wheels in (FOUR, TWO) for n in range(len(wheels.names))]
+)
 @pytest.mark.parametrize("kind", ["reversed", "runaway"])
-def test_a_faulty_encoder_stops_the_robot_and_is_named(world: World, wheel: int, kind: str) -> None:
+def test_a_faulty_encoder_stops_the_robot_and_is_named(
+    world: World, wheels: WheelMap, wheel: int, kind: str
+) -> None:
     world.drive(0.5, seconds=1.5)
+    motor = wheels.letters.index(wheels.motors[wheel][1])
     faults: dict[str, AbstractContextManager[None]] = {
-        "reversed": world.mcu.fault("bias", wheel, -1.0),
-        "runaway": world.mcu.fault("bias", wheel, 2.0),
+        "reversed": world.mcu.fault("bias", motor, -1.0),
+        "runaway": world.mcu.fault("bias", motor, 2.0),
     }
     with faults[kind]:
         world.hold(0.5, seconds=2.0)
         assert world.state.mode == "fault"
-        assert WHEELS[wheel] in world.state.reason
+        assert world.state.reason.startswith(f"{wheels.names[wheel]} wheel ")
         assert stopped(world)
+    causes = [event.text for event in world.events if event.name == "fault"]
+    assert len(causes) == 1
     world.hold(0.5, seconds=1.0)
     assert world.state.mode == "fault"
     assert world.call("clear").success
@@ -101,11 +117,11 @@ def test_a_limit_below_one_count_of_an_encoder_hides_neither_the_way_nor_a_runaw
 
 @pytest.mark.parametrize(("configured", "real"), [(0, 20), (20, 20), (0, 3200)])
 @pytest.mark.parametrize("drives", [False, True])
-@pytest.mark.parametrize("speed", [95.0, 99.99])
+@pytest.mark.parametrize(("speed", "wheels"), [(95.0, FOUR), (99.99, FOUR), (95.0, TWO)])
 def test_lasting_impossible_speeds_are_a_fault_although_one_count_is_excused(
-    configured: int, real: int, drives: bool, speed: float
+    configured: int, real: int, drives: bool, speed: float, wheels: WheelMap
 ) -> None:
-    mcu = McuConfig(encoder_counts=configured)
+    mcu = McuConfig(encoder_counts=configured, wheels=wheels)
     world = World(Config(mcu=mcu, sim=SimConfig(encoder_counts=real)))
     world.run(0.5)
     world.drive(0.5, seconds=2.0)
@@ -117,14 +133,13 @@ def test_lasting_impossible_speeds_are_a_fault_although_one_count_is_excused(
     assert abs(world.state.x - began) < 0.3
 
 
-@pytest.mark.parametrize("speed", [95.0, 99.99])
+@pytest.mark.parametrize(("speed", "wheels"), [(95.0, FOUR), (99.99, FOUR), (95.0, TWO)])
 @pytest.mark.parametrize("drives", [False, True])
 @pytest.mark.parametrize("every", [20, 50])
 def test_impossible_lines_do_not_teach_that_the_encoders_are_coarse(
-    speed: float, drives: bool, every: int
+    world: World, speed: float, drives: bool, every: int
 ) -> None:
-    world = World()
-    world.run(0.5)
+    world.run(0.3)
     world.drive(0.3 if drives else 0.0, seconds=1.0)
     damaged = damage(world, every=every, speeds=(speed, 6.0, 6.0, speed))
     world.hold(0.3 if drives else 0.0, seconds=12.0)
@@ -132,15 +147,18 @@ def test_impossible_lines_do_not_teach_that_the_encoders_are_coarse(
     assert abs(world.state.yaw) < 0.05
 
 
+@four_and_two
 @pytest.mark.parametrize("speeds_up", [False, True])
-def test_wheels_with_few_counts_are_a_fault_only_if_they_are_too_fast(speeds_up: bool) -> None:
+def test_wheels_with_few_counts_are_a_fault_only_if_they_are_too_fast(
+    speeds_up: bool, wheels: WheelMap
+) -> None:
     """The board is asked as often as possible without its counts."""
-    config = Config(control=ControlConfig(rate=MOST_ASKED_HZ), sim=SimConfig(encoder_counts=16))
-    world = World(config)
+    control, sim = ControlConfig(rate=MOST_ASKED_HZ), SimConfig(encoder_counts=16)
+    world = World(Config(control=control, sim=sim, mcu=McuConfig(wheels=wheels)))
     world.run(0.3)
     world.drive(0.1, seconds=2.0)
     with ExitStack() as faster:
-        for wheel in range(4 * speeds_up):
+        for wheel in range(len(wheels.names) * speeds_up):
             faster.enter_context(world.mcu.fault("bias", wheel, 1.6))
         world.hold(0.1, seconds=8.0)
     assert world.state.code == ("wheel_too_fast" if speeds_up else "commanded")
@@ -153,7 +171,9 @@ def event_texts(world: World, name: str) -> list[str]:
     return [event.text for event in world.events if event.name == name]
 
 
-@pytest.mark.parametrize("verb", ["", "deactivate", "stop"])
+@pytest.mark.parametrize(
+    ("verb", "wheels"), [("", FOUR), ("deactivate", FOUR), ("stop", FOUR), ("", TWO)]
+)
 def test_wheels_turned_by_hand_are_reported_at_most_once_a_second_and_counted(
     world: World, verb: str
 ) -> None:
@@ -172,6 +192,7 @@ def test_wheels_turned_by_hand_are_reported_at_most_once_a_second_and_counted(
 @pytest.mark.parametrize(
     ("linear", "way"), list(product((0.2, 0.5, -1.0), ("stop", "zero", "silence")))
 )
+@four_and_two
 def test_a_robot_that_does_not_obey_a_stop_is_a_fault_as_soon_as_it_is_evident(
     world: World, linear: float, way: str
 ) -> None:
@@ -203,6 +224,7 @@ def test_a_robot_that_does_not_obey_a_stop_is_a_fault_as_soon_as_it_is_evident(
     assert took <= within + 0.021
 
 
+@four_and_two
 def test_a_robot_that_still_rolls_after_a_lost_link_is_a_runaway(world: World) -> None:
     """The robot was driving when the link was lost, and still moves when the link returns.
 
@@ -218,11 +240,13 @@ def test_a_robot_that_still_rolls_after_a_lost_link_is_a_runaway(world: World) -
     assert world.state.code == "wheel_runaway"
 
 
-def test_a_computer_that_stutters_makes_no_fault_of_a_sound_wheel_with_counts() -> None:
+@four_and_two
+def test_a_computer_that_stutters_makes_no_fault_of_a_sound_wheel_with_counts(
+    wheels: WheelMap,
+) -> None:
     """A line that ends a silence has the counts of all of it."""
-    world = World(
-        Config(mcu=McuConfig(link_check="on", encoder_counts=20), sim=SimConfig(encoder_counts=20))
-    )
+    mcu = McuConfig(link_check="on", encoder_counts=20, wheels=wheels)
+    world = World(Config(mcu=mcu, sim=SimConfig(encoder_counts=20)))
     world.run(0.2)
     world.drive(0.6, seconds=1.5)
     for number in range(120):

@@ -6,6 +6,7 @@ import math
 import random
 from contextlib import AbstractContextManager, ExitStack
 from functools import partial
+from typing import Any
 
 import pytest
 from msgspec.structs import replace
@@ -16,11 +17,13 @@ from acsard.core.config.settings import (
     McuConfig,
     OdometryConfig,
     SimConfig,
+    WheelMap,
 )
 from acsard.core.messages.schema import DiagnosticArray, DiagnosticStatus
 from acsard.core.values import WHEELS
 from tests.scenarios.imperfect_gyro import ImperfectGyro
 from tests.scenarios.world import World
+from tests.wheels import FOUR, TWO
 
 COUNTS = SimConfig().encoder_counts
 
@@ -165,24 +168,54 @@ def test_a_wheel_that_is_ignored_as_dead_leaves_the_turn_rate_uncertain() -> Non
 
 
 @pytest.mark.variations(3)
-@pytest.mark.parametrize("kind", ["dead motor", "reversed motor", "both right encoders"])
+@pytest.mark.parametrize(
+    ("kind", "wheels"),
+    [
+        ("dead motor", FOUR), ("reversed motor", FOUR), ("all right encoders", FOUR),
+        ("all right encoders", TWO),
+    ],
+)  # fmt: skip
 @pytest.mark.parametrize(("linear", "angular"), [(0.5, 0.0), (0.3, 1.0)])
 def test_a_wheel_that_may_be_right_although_it_is_ignored_is_in_the_covariance(
-    kind: str, linear: float, angular: float
+    kind: str, linear: float, angular: float, wheels: WheelMap
 ) -> None:
-    made = World(Config(mcu=McuConfig(encoder_counts=COUNTS), odometry=SURE))
+    mcu = McuConfig(encoder_counts=COUNTS, wheels=wheels)
+    made = World(Config(mcu=mcu, odometry=SURE))
     made.run(1.5)
     made.drive(linear, angular, seconds=2.0)
     before = off(made)[1]
+    right = {motor[1] for name, motor in named(wheels) if "right" in name}
     with ExitStack() as faults:
-        if kind == "both right encoders":
-            mcu = made.mcu
-            faults.enter_context(pytest.MonkeyPatch.context()).setattr(
-                mcu, "_speeds", lambda now, read=mcu._speeds: [0.0, *read(now)[1:3], 0.0]
-            )
+        if kind == "all right encoders":
+            board = made.mcu
+
+            def speeds(now_ns: int, read: Any = board._speeds) -> list[float]:
+                by_motor = zip(board.letters, read(now_ns), strict=True)
+                return [0.0 if letter in right else speed for letter, speed in by_motor]
+
+            faults.enter_context(pytest.MonkeyPatch.context()).setattr(board, "_speeds", speeds)
         else:
             faults.enter_context(made.mcu.fault(kind.replace(" ", "_"), 0))
         made.hold(linear, angular, seconds=1.0)
         made.run(1.0)
     error, std = off(made)[1] - before, math.sqrt(made.odom.pose.covariance[35])
     assert 0.1 < error < 3.0 * std
+
+
+def named(wheels: WheelMap) -> list[tuple[str, str]]:
+    return list(zip(wheels.names, wheels.motors, strict=True))
+
+
+@pytest.mark.parametrize("wheel", range(2))
+def test_of_two_wheels_none_is_left_out_and_a_dead_encoder_is_reported_once(wheel: int) -> None:
+    made = World(Config(mcu=McuConfig(encoder_counts=COUNTS, wheels=TWO)))
+    made.run(1.5)
+    made.drive(0.3, seconds=1.0)
+    name, letter = named(TWO)[wheel]
+    with made.mcu.fault("stuck_encoder", TWO.letters.index(letter[1])):
+        made.hold(0.6, -0.8, seconds=3.0)
+        assert made.state.wheel_fault.startswith(f"{name} wheel is blocked")
+        assert (row(made).level, row(made).message) == (1, made.state.wheel_fault)
+    reports = [event.text for event in made.events if event.name == "wheel_fault"]
+    assert len(reports) == 1
+    assert made.state.mode == "driving"
