@@ -123,16 +123,25 @@ CASES: dict[str, tuple[float, ...]] = {
 """The arguments of each fault of the simulator that a drive goes through."""
 
 
-def drive_through_faults(world: World, seconds: float, seed: int = 1) -> list[str]:
+def of_board(world: World, name: str, arguments: tuple[float, ...]) -> list[float]:
+    """Return the arguments of a fault with motors that the board has."""
+    kinds, motors = FAULTS[name].arguments.split(":"), len(world.mcu.letters)
+    given = zip(kinds, arguments, strict=False)
+    return [value % motors if kind == "MOTOR" else value for kind, value in given]
+
+
+def drive_through_faults(
+    world: World, seconds: float, seed: int = 1, cases: dict[str, tuple[float, ...]] = CASES
+) -> list[str]:
     """Drive with each fault in turn for half a second, then cause all other events, and repeat.
 
     Returns the names of the faults.
     """
     dice, end_ns, had = random.Random(seed), world.now_ns + int(seconds * 1e9), []
     while True:
-        for name, arguments in CASES.items():
+        for name, arguments in cases.items():
             world.drive(dice.uniform(-1.5, 1.5), dice.uniform(-3, 3), 0.4, hz=20.0)
-            with world.mcu.fault(name, *arguments):
+            with world.mcu.fault(name, *of_board(world, name, arguments)):
                 world.hold(dice.uniform(-1, 1), dice.uniform(-2, 2), seconds=0.5)
             if world.state.mode == "fault":
                 world.send(0.0)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from contextlib import nullcontext
 
 import pytest
@@ -13,15 +14,16 @@ from acsard.core.config.settings import (
     Config,
     McuConfig,
     SimConfig,
+    WheelMap,
 )
 from acsard.core.messages.schema import DiagnosticArray
 from acsard.core.simulator import protocol
 from acsard.core.simulator.fake_mcu import FakeMcu
 from acsard.core.values import NS_PER_S
 from tests.scenarios.world import World
+from tests.wheels import four_and_two
 
 MS = 1_000_000
-ZERO = b"ap00.00,bp00.00,cp00.00,dp00.00"
 
 
 def config(check: str = "on", counts: int = 0, **mcu: object) -> Config:
@@ -35,7 +37,7 @@ def started(made: Config) -> World:
 
 
 def moving(lines: list[bytes]) -> list[bytes]:
-    return [line for line in lines if line.strip() and not line.startswith((ZERO, b"?"))]
+    return [line for line in lines if re.search(rb"[1-9]", line.partition(b"#")[0])]
 
 
 def check_of(world: World) -> str:
@@ -57,23 +59,25 @@ def texts(world: World, name: str) -> list[str]:
 # the firmware at the other end
 
 
-def test_a_new_mcu_is_driven_with_checked_lines() -> None:
-    world = started(config())
+@four_and_two
+def test_a_new_mcu_is_driven_with_checked_lines(wheels: WheelMap) -> None:
+    world = started(config(wheels=wheels))
     world.drive(0.5, seconds=2.0)
     assert world.state.mode == "driving"
     assert check_of(world) == "checked"
     assert texts(world, "link_check") == []
     lines = moving(world.lines())
     assert len(lines) > 150
-    assert all(protocol.reference(line, "abcd") and b"#" in line for line in lines)
+    assert all(protocol.reference(line, wheels.letters) and b"#" in line for line in lines)
     world.run(1.5)
     assert stopped(world)
     assert world.state.x == pytest.approx(world.mcu.vehicle.pose.x, abs=0.005)
     assert set(world.state.counters) <= {"lines", "lines_sent", "commands"}
 
 
-def test_a_new_mcu_is_driven_with_samples_when_counts_are_configured() -> None:
-    world = started(config(counts=3200))
+@four_and_two
+def test_a_new_mcu_is_driven_with_samples_when_counts_are_configured(wheels: WheelMap) -> None:
+    world = started(config(counts=3200, wheels=wheels))
     world.drive(0.5, seconds=1.0)
     assert check_of(world) == "checked with samples"
     assert all(b"S*" in line for line in moving(world.lines()))
@@ -110,8 +114,9 @@ def test_old_firmware_is_never_driven_on_a_checked_link_and_the_reason_names_the
 
 @pytest.mark.variations(3)
 @pytest.mark.parametrize("every", [2, 3, 7])
-def test_bit_errors_both_ways_change_no_speed(every: int) -> None:
-    world = started(config("on", 3200))
+@four_and_two
+def test_bit_errors_both_ways_change_no_speed(every: int, wheels: WheelMap) -> None:
+    world = started(config("on", 3200, wheels=wheels))
     world.drive(0.4, seconds=0.5)
     set_points: set[float] = set()
     with world.mcu.fault("bit_errors", every):
@@ -188,10 +193,11 @@ class Echo(FakeMcu):
     [pytest.param(0, 0, id="prompt"), pytest.param(0, 16, id="adapter"),
      pytest.param(30, 0, id="radio"), pytest.param(60, 0, id="slow radio")],
 )  # fmt: skip
+@four_and_two
 def test_a_serial_line_that_echoes_is_never_driven(
-    check: str, counts: int, delay_ms: int, latency_ms: int
+    check: str, counts: int, delay_ms: int, latency_ms: int, wheels: WheelMap
 ) -> None:
-    world = World(config(check, counts), plugged=False)
+    world = World(config(check, counts, wheels=wheels), plugged=False)
     echo = Echo(world.config, world.now_ns)
     echo.switches.extra_delay_ns, echo.switches.latency_ns = delay_ms * MS, latency_ms * MS
     world.port.plug(echo)

@@ -16,19 +16,29 @@ from acsard.core.config.settings import (
 )
 from acsard.core.messages.schema import Beat, JointState, TFMessage
 from tests.scenarios.world import World
+from tests.wheels import FOUR, four_and_two
 
 
 @pytest.fixture
-def world() -> World:
-    world = World()
+def wheels() -> WheelMap:
+    return FOUR
+
+
+@pytest.fixture
+def world(wheels: WheelMap) -> World:
+    world = World(Config(mcu=McuConfig(wheels=wheels)))
     world.run(0.2)
     world.send(0.0)
     world.run(0.05)
     return world
 
 
-def test_two_seconds_at_half_a_metre_per_second_is_one_metre(world: World) -> None:
+@four_and_two
+def test_two_seconds_at_half_a_metre_per_second_is_one_metre(
+    world: World, wheels: WheelMap
+) -> None:
     world.drive(0.5, seconds=2.0)
+    assert world.state.wheels == pytest.approx([10.0] * len(wheels.names), abs=0.3)
     world.send(0.0)
     world.run(1.0)
     assert world.odom.pose.pose.position.x == pytest.approx(1.0, rel=0.02)
@@ -91,12 +101,23 @@ def test_wheels_can_be_commanded_by_name_in_any_order(wheels: WheelMap, line: by
     assert world.state.source == "ros2_control"
 
 
-def test_a_reversed_motor_changes_the_sign_of_command_and_feedback_once() -> None:
-    world = World(Config(mcu=McuConfig(wheels=WheelMap(front_left="-a", front_right="+b"))))
-    world.run(0.2)
+@pytest.mark.parametrize(
+    ("wheels", "line"),
+    [
+        (WheelMap(front_left="-a", front_right="+b"), b"an10.00,bp10.00,cp10.00,dp10.00\r\n"),
+        (WheelMap(left="-l", right="+r"), b"ln10.00,rp10.00\r\n"),
+        (WheelMap(left="-z", right="+b"), b"bp10.00,zn10.00\r\n"),
+    ],
+)
+def test_a_reversed_motor_changes_the_sign_of_command_and_feedback_once(
+    world: World, line: bytes
+) -> None:
     world.drive(0.5, seconds=1.0)
-    assert world.lines()[-1] == b"an10.00,bp10.00,cp10.00,dp10.00\r\n"
+    assert world.lines()[-1] == line
     assert world.state.wheels[1] == pytest.approx(10.0, abs=0.3)
+    world.drive(0.0, 1.0, seconds=1.0)
+    assert world.state.wheels[:2] == pytest.approx([3.0, -3.0], abs=0.3)
+    assert world.mcu.vehicle.pose.yaw == pytest.approx(world.state.yaw, abs=0.03)
 
 
 def test_slip_is_undone_by_the_wheel_separation_multiplier() -> None:

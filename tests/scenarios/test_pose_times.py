@@ -9,10 +9,11 @@ from typing import Literal
 import numpy as np
 import pytest
 
-from acsard.core.config.settings import Config, McuConfig, SimConfig
-from acsard.core.values import Estimate
+from acsard.core.config.settings import Config, ControlConfig, McuConfig, SimConfig, WheelMap
+from acsard.core.values import Estimate, Received
 from tests.scenarios.world import World
 from tests.stepped import Outputs
+from tests.wheels import four_and_two
 
 FINE = SimConfig(encoder_counts=20_000)
 """Fine encoders, so that the two decimals of a line limit its accuracy."""
@@ -179,3 +180,38 @@ def test_errors_of_many_equal_silences_add_up_within_the_covariance(
     made.drive(0.0, 0.0, 1.5)
     error, variance = made.mcu.vehicle.pose.x - made.state.x, made.odom.pose.covariance[0]
     assert abs(error) < 2.0 * math.sqrt(variance), f"{error:+.3f} m"
+
+
+@pytest.mark.variations(5)
+@pytest.mark.parametrize("wheel", [0, 1])
+@pytest.mark.parametrize("tens", [b"0", b"3", b"5"])
+@pytest.mark.parametrize(("rate", "silence_s"), [(10.0, 0.0), (100.0, 0.15), (100.0, 0.5)])
+@four_and_two
+def test_a_damaged_speed_in_a_long_line_or_after_a_silence_is_in_the_covariance(
+    rate: float, silence_s: float, tens: bytes, wheel: int, wheels: WheelMap
+) -> None:
+    """The robot drives on. One line reports another digit for tens of rad/s of one wheel."""
+    made = World(Config(mcu=McuConfig(wheels=wheels), control=ControlConfig(rate=rate)))
+    made.run(1.0)
+    made.drive(0.6, 0.0, 2.0)
+    feed, damaged = made.port.feed, [0]
+
+    def damages(received: Received) -> None:
+        data = bytearray(received.data)
+        place = data.find(wheels.motors[wheel][1].encode() + b"p")
+        if place >= 0 and not damaged[0]:
+            data[place + 2 : place + 3], damaged[0] = tens, 1
+        feed(Received(received.at, bytes(data)))
+
+    with pytest.MonkeyPatch.context() as cable:
+        cable.setattr(made.port, "feed", lambda received: None)
+        made.hold(0.6, 0.0, silence_s)
+        cable.setattr(made.port, "feed", damages)
+        made.hold(0.6, 0.0, 1.0)
+    made.drive(0.0, 0.0, 1.5)
+    true, state, covariance = made.mcu.vehicle.pose, made.state, made.odom.pose.covariance
+    turned = abs(math.remainder(state.yaw - true.yaw, math.tau))
+    assert damaged[0]
+    assert turned < 3.0 * math.sqrt(covariance[35])
+    off = math.dist((state.x, state.y), (true.x, true.y))
+    assert off < 3.0 * math.sqrt(covariance[0] + covariance[7])

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from msgspec.structs import replace
 
-from acsard.core.config.settings import Config, RecordConfig
+from acsard.core.config.settings import Config, McuConfig, RecordConfig
 from acsard.core.link.serial_output import Offered
 from acsard.core.robot import Robot
 from acsard.core.values import Instant
@@ -18,11 +18,15 @@ from acsard.recording.file import Head, Recording, listed
 from acsard.recording.recorder import Recorder
 from acsard.recording.replay import Playback, Replay
 from tests.scenarios.taped import (
+    BATCH,
+    WITH_ARGUMENTS,
     Tape,
+    drive_through_faults,
     recorded_world,
     replayed,
 )
 from tests.scenarios.world import World
+from tests.wheels import TWO
 
 PLAIN = Config()
 SLOW_LIMITS = replace(PLAIN, limits=replace(PLAIN.limits, linear_speed=0.3))
@@ -50,6 +54,23 @@ def test_a_replay_counts_lines_and_commands_as_the_daemon_did() -> None:
     assert counters["lines_superseded"] == 7
     assert counters["commands_superseded"] == 1
     assert replayed(tape, PLAIN).robot.state.counters == counters
+
+
+def test_a_drive_of_two_wheels_replays_to_the_bit_from_its_start_and_its_states() -> None:
+    config = replace(PLAIN, mcu=McuConfig(wheels=TWO))
+    tape, world = recorded_world(config, every=5 * BATCH)
+    world.run(0.5)
+    faults = drive_through_faults(world, 13.0, cases=WITH_ARGUMENTS)
+    assert {"dead_motor", "swapped_wheels"} <= {*faults}
+    world.drive(0.4, 0.3, seconds=1.0)
+    for fault in ("dead_motor", "reversed_encoder"):
+        with world.mcu.fault(fault, 0):
+            world.hold(0.4, 0.3, seconds=2.0)
+    assert {"wheel_fault", "fault"} <= {event.name for event in world.events}
+    for first in (0, *tape.states):
+        comparison = replayed(tape, config, first).comparison
+        assert comparison.exact, first
+        assert comparison.all["lines"] == comparison.equal["lines"]
 
 
 def test_a_line_that_differs_is_reported_with_the_inputs_of_both_sides() -> None:

@@ -13,9 +13,11 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
+from acsard.core.config.settings import WheelMap
 from acsard.core.link.line_times import FreeRunning
 from acsard.core.values import Instant
 from tests.unit.board_drives import Adapter, Case, drive
+from tests.wheels import four_and_two
 
 ADAPTERS: tuple[Adapter, ...] = ("acm", "ftdi")
 
@@ -40,14 +42,17 @@ def check(name: str, case: Case, mm: float, deg: float) -> None:
 
 @pytest.mark.variations(4)
 @pytest.mark.parametrize("stall", [0.0, STALL])
+@four_and_two
 @pytest.mark.parametrize(
     ("counts", "thinking", "mm", "deg"),
     [(20, 0.0002, 5, 0.1), (20, 0.004, 5, 0.1), (3200, 0.0002, 15, 0.15), (3200, 0.004, 15, 0.2)],
 )
 def test_a_board_that_answers_within_5_ms_is_where_its_counts_say(
-    counts: int, thinking: float, mm: float, deg: float, stall: float
+    counts: int, thinking: float, mm: float, deg: float, stall: float, wheels: WheelMap
 ) -> None:
-    case = Case(prompted=True, counts=counts, thinking=thinking, stall=stall, stall_every=1.0)
+    case = Case(
+        prompted=True, counts=counts, thinking=thinking, stall=stall, stall_every=1.0, wheels=wheels
+    )
     bound = (25, 0.25) if stall and counts > 400 else (mm, deg)
     check(f"prompted, {counts} counts, stalls of {stall} s", case, *bound)
 
@@ -55,10 +60,13 @@ def test_a_board_that_answers_within_5_ms_is_where_its_counts_say(
 @pytest.mark.variations(3)
 @pytest.mark.parametrize("stall", [0.0, STALL])
 @pytest.mark.parametrize("counts", [20, 96, 3200])
-def test_a_free_running_board_is_where_its_counts_say(counts: int, stall: float) -> None:
+@four_and_two
+def test_a_free_running_board_is_where_its_counts_say(
+    counts: int, stall: float, wheels: WheelMap
+) -> None:
     check(
         f"free-running, {counts} counts, stalls of {stall} s",
-        Case(counts=counts, stall=stall, stall_every=1.0),
+        Case(counts=counts, stall=stall, stall_every=1.0, wheels=wheels),
         1,
         0.05,
     )
@@ -67,7 +75,10 @@ def test_a_free_running_board_is_where_its_counts_say(counts: int, stall: float)
 @pytest.mark.variations(3)
 @pytest.mark.parametrize("counts", [20, 96, 3200])
 @pytest.mark.parametrize("adapter", ADAPTERS)
-def test_a_checked_link_with_counts_loses_nothing(counts: int, adapter: Adapter) -> None:
+@four_and_two
+def test_a_checked_link_with_counts_loses_nothing(
+    counts: int, adapter: Adapter, wheels: WheelMap
+) -> None:
     case = Case(
         adapter,
         prompted=True,
@@ -77,6 +88,7 @@ def test_a_checked_link_with_counts_loses_nothing(counts: int, adapter: Adapter)
         lost=0.2,
         stall=STALL,
         stall_every=1.0,
+        wheels=wheels,
     )
     # A lost line loses no count, but the shape of the arc in it.
     check(f"checked, {counts} counts, 20 % lost, {adapter}", case, 10 if counts < 400 else 2, 0.01)

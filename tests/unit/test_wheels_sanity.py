@@ -6,12 +6,14 @@ import math
 from typing import Any
 
 import pytest
+from msgspec.structs import replace
 
 from acsard.core.link.feedback import Line
 from acsard.core.motion import sanity as module
 from acsard.core.motion.sanity import Sanity
 from acsard.core.values import WHEELS, Event, Instant, WheelSpeeds
 from tests.each import each
+from tests.wheels import MAPS
 
 UNKNOWN = math.inf
 """The largest change by one count of encoders that are not known yet, rad/s."""
@@ -140,13 +142,20 @@ def test_lines(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     assert verdicts(Sanity(), some, fastest) == expected
 
 
-@each("wheel", range(4))
-def test_the_reason_names_the_wheel_and_the_setting(wheel: int) -> None:
-    assert Sanity().impossible(line(-80.01, wheel), 80.0, WHEELS).startswith(WHEELS[wheel])
+@each(("names", "wheel"), [(maps.names, n) for maps in MAPS for n in range(len(maps.names))])
+def test_the_reason_names_the_wheel_and_the_setting(names: tuple[str, ...], wheel: int) -> None:
+    def alone(speed: float) -> Line:
+        """Return a line with the speed of this wheel; of two, the rear ones do as the front."""
+        speeds = list(only(wheel, speed).as_tuple())
+        if len(names) == 2:
+            speeds[3 - wheel] = speed
+        return replace(line(speed), speeds=WheelSpeeds(*speeds))
+
+    assert Sanity().impossible(alone(-80.01), 80.0, names).startswith(names[wheel])
     sanity = Sanity()
     assert verdicts(sanity, lines(0, 0)) == ".."
-    why = sanity.impossible(line(60, wheel), 80.0, WHEELS)
-    assert why == f"{WHEELS[wheel]} jumps from 0.00 to 60.00 rad/s, which is over 1500 rad/s2"
+    why = sanity.impossible(alone(60), 80.0, names)
+    assert why == f"{names[wheel]} jumps from 0.00 to 60.00 rad/s, which is over 1500 rad/s2"
 
 
 def test_forgetting_starts_over_but_the_last_line_is_still_compared() -> None:
