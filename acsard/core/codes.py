@@ -289,9 +289,9 @@ reply_period
     -> if it reports by its own clock, set mcu.reply_period = {interval}
 received_nothing
     no link to the microcontroller: {received};
-    -> does the board have power, is mcu.port its port, is mcu.baud_rate right, are TX and RX
-    swapped, are its letters those of mcu.wheels, does another program read the port (`acsard
-    doctor`){firmware}? `acsard mcu check` finds out more
+    -> does the board have power, is mcu.port its port, is mcu.baud_rate right, does mcu.wheels name
+    its motors, are TX and RX swapped, does another program read the port
+    (`acsard doctor`){firmware}? `acsard mcu check` finds out more
 received_statuses
     no link to the microcontroller: {received};
     -> is TX of this computer connected to RX of the board? `acsard mcu check` finds out more

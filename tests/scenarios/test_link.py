@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from contextlib import AbstractContextManager
+from contextlib import AbstractContextManager, nullcontext
 
 import pytest
 
-from acsard.core.config.settings import Config, ControlConfig, McuConfig
+from acsard.core.config.settings import Config, ControlConfig, McuConfig, WheelMap
+from acsard.core.simulator.fake_mcu import FakeMcu
 from tests.scenarios.world import World
+from tests.wheels import FOUR, TWO
 
 ZERO = b"ap00.00,bp00.00,cp00.00,dp00.00\r\n"
 
@@ -164,3 +166,25 @@ def test_a_stall_of_this_computer_does_not_stop_the_robot_without_a_ramp(stall: 
         world.stall(stall)
         world.hold(0.8, seconds=0.3)
         assert b"ap00.00" not in b"".join(line for _, line in list(world.port.sent)[lines:])
+
+
+@pytest.mark.parametrize(
+    ("wheels", "motors"), [(TWO, FOUR), (FOUR, TWO), (TWO, WheelMap(left="+a", right="+b"))]
+)
+@pytest.mark.parametrize(
+    ("reports", "code"), [(0.01, "received_letters"), (0.0, "received_nothing")]
+)
+def test_a_board_with_other_motors_is_never_driven_and_the_advice_names_the_setting(
+    wheels: WheelMap, motors: WheelMap, reports: float, code: str
+) -> None:
+    """It answers no line of other motors, but may report by its own clock."""
+    config = Config(mcu=McuConfig(wheels=wheels, reply_period=reports))
+    world = World(config, plugged=False)
+    board = FakeMcu(Config(mcu=McuConfig(wheels=motors)), world.now_ns)
+    world.port.plug(board)
+    with board.fault("free_running", 0.01) if reports else nullcontext():
+        world.run(0.5)
+        world.drive(0.5, seconds=4.0)
+    assert (world.state.link, world.state.code) == ("booting", code)
+    assert "mcu.wheels" in world.state.reason
+    assert board.vehicle.set_points == [0.0] * 4

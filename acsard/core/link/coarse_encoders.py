@@ -29,8 +29,8 @@ LARGEST_JUMP = 1.5 * COARSEST_COUNT
 
 # By the number of driven wheels: jumps, each in the other direction than the one before, of a wheel
 # in a block of `CHANGES` of the speeds of all wheels: fewer are damaged lines. If 5 % of the lines
-# have two false values, 0.5 % of the lines of four wheels count as coarse, and 0.6 % of two (3 % with
-# 3 jumps).
+# have two false values, 0.5 % of the lines of four wheels count as coarse, and 0.6 % of those of
+# two (3 % with 3 jumps).
 MIN_JUMPS, CHANGES = {4: 3, 2: 5}, 96
 
 # Over a longer time than this, a change of speed may be an acceleration.
