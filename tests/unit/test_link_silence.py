@@ -39,6 +39,10 @@ HEARD: dict[str, tuple[bytes, str, str]] = {
         "foreign",
         r"lines received, none good, the last one is `\x00\xff~ap00.00,bp00.00,cp00.00,dp00.00`",
     ),
+    "torn by a status line": (
+        b"ap00.00,bp00.00,!status volts=24.68 amps=-0.50\r\n", "garbage", "none good"
+    ),
+    "cut behind three values": (b"ap00.00,bp00.00,cp00.00\r\n", "cut", "none good"),
     "wrong baud rate": (b"\xf8\x00\xe6\n\x9e" * 3, "garbage", "3 lines received, none good"),
     "no end": (
         b"\xf8\x00\xe6" * 3, "garbage", r"the last bytes are `\xf8\x00\xe6\xf8\x00\xe6\xf8\x00\xe6`"
