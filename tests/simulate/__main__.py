@@ -15,6 +15,7 @@ import time
 from collections import Counter
 from collections.abc import Callable, Iterator
 from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +30,9 @@ HERE = Path(__file__).parent
 LARGEST = ("largest container", "largest text", "largest buffer")
 """Counts of which the table has the largest value of all runs, and not the sum."""
 
+PlanOf = Callable[[int], Plan]
+"""Makes the plan of a seed."""
+
 MOST_SHRUNK = 3
 """Number of findings whose plans a run shrinks. To shrink one plan takes up to 400 runs of it."""
 
@@ -42,7 +46,9 @@ def commit() -> str:
     return result.stdout.strip() or "unknown"
 
 
-def results(seed: int, seconds: float, workers: int, within_s: float) -> Iterator[Result]:
+def results(
+    seed: int, seconds: float, workers: int, within_s: float, plan_of: PlanOf
+) -> Iterator[Result]:
     """Play the plans of consecutive seeds in parallel, and yield their results.
 
     It ends after `seconds` of simulated time in total, or after `within_s` of real time.
@@ -51,7 +57,7 @@ def results(seed: int, seconds: float, workers: int, within_s: float) -> Iterato
     with ProcessPoolExecutor(workers, initializer=collect_seldom) as pool:
         # A worker that is not forked, as in Python 3.14, does not import a package's `__main__`, so
         # the function must be in another module.
-        running = {pool.submit(played, make_plan(seed + n)) for n in range(workers)}
+        running = {pool.submit(played, plan_of(seed + n)) for n in range(workers)}
         following, total = seed + workers, 0.0
         while running:
             done, running = wait(running, return_when=FIRST_COMPLETED)
@@ -60,7 +66,7 @@ def results(seed: int, seconds: float, workers: int, within_s: float) -> Iterato
                 total += result.simulated_s
                 yield result
                 if total < seconds and time.monotonic() < end:
-                    running.add(pool.submit(played, make_plan(following)))
+                    running.add(pool.submit(played, plan_of(following)))
                     following += 1
 
 
@@ -79,7 +85,7 @@ def table(counts: Counter[str]) -> str:
 
 
 def explore(
-    seed: int, hours: float, workers: int, within_s: float = math.inf, plans: Path | None = None
+    seed: int, hours: float, workers: int, within_s: float, plans: Path | None, plan_of: PlanOf
 ) -> int:
     """Play random plans for this many simulated hours. Return the number of broken promises.
 
@@ -88,7 +94,7 @@ def explore(
     broken: list[Result] = []
     counts, simulated, cpu, findings, runs = Counter[str](), 0.0, 0.0, 0, 0
     began = time.perf_counter()
-    for result in results(seed, hours * 3600, workers, within_s):
+    for result in results(seed, hours * 3600, workers, within_s, plan_of):
         runs += 1
         simulated += result.simulated_s
         cpu += result.cpu_s
@@ -108,11 +114,11 @@ def explore(
         f"core, {findings} findings"
     )
     if plans is not None:
-        keep_plans(broken, plans)
+        keep_plans(broken, plans, plan_of)
     return findings
 
 
-def keep_plans(broken: list[Result], where: Path) -> None:
+def keep_plans(broken: list[Result], where: Path, plan_of: PlanOf) -> None:
     """Write the plan of each finding into a directory, and replace the first ones by shrunk plans.
 
     Shrinking may take an hour, and a CI job may end before it is over.
@@ -120,15 +126,15 @@ def keep_plans(broken: list[Result], where: Path) -> None:
     found_by = commit()
     for result in broken:
         path = where / f"{result.seed}.json"
-        print(shrink.write_corpus_file(make_plan(result.seed), result, found_by, path), flush=True)
+        print(shrink.write_corpus_file(plan_of(result.seed), result, found_by, path), flush=True)
     for result in broken[:MOST_SHRUNK]:
-        small = shrink.shrunk(make_plan(result.seed), result)
+        small = shrink.shrunk(plan_of(result.seed), result)
         shrink.write_corpus_file(small, result, found_by, where / f"{result.seed}.json")
 
 
-def replay(what: str, log: Callable[[dict[str, Any]], None] | None = None) -> int:
+def replay(what: str, log: Callable[[dict[str, Any]], None] | None, plan_of: PlanOf) -> int:
     """Play the plan of a seed, or the plan in a JSON file."""
-    plan = shrink.load(Path(what)) if what.endswith(".json") else make_plan(int(what))
+    plan = shrink.load(Path(what)) if what.endswith(".json") else plan_of(int(what))
     result = played(plan, log)
     if result.finding:
         show(result)
@@ -140,9 +146,9 @@ def print_step(step: dict[str, Any]) -> None:
     print(msgspec.json.encode(step).decode())
 
 
-def reduce(seed: int, keep: str) -> int:
+def reduce(seed: int, keep: str, plan_of: PlanOf) -> int:
     """Shrink the plan of a seed that breaks a promise. Print the result, or store it."""
-    plan = make_plan(seed)
+    plan = plan_of(seed)
     result = played(plan)
     if not result.finding:
         print(f"seed {seed} breaks no promise")
@@ -173,19 +179,22 @@ def main() -> int:
     parser.add_argument("--plans", metavar="DIR", type=Path, help="keep the plan of each finding")
     parser.add_argument("--steps", action="store_true", help="with --replay: print each step")
     parser.add_argument("--digests", metavar="SEEDS", type=int, help="print one of each plan")
+    parser.add_argument("--wheels", type=int, choices=(2, 4), help="of each robot")
     options = parser.parse_args()
+    plan_of = partial(make_plan, wheels=options.wheels)
     if options.replay:
-        return replay(options.replay, print_step if options.steps else None)
+        return replay(options.replay, print_step if options.steps else None, plan_of)
     if options.shrink is not None:
-        return reduce(options.shrink, options.keep)
+        return reduce(options.shrink, options.keep, plan_of)
     if options.digests:
         with ProcessPoolExecutor(options.workers, initializer=collect_seldom) as pool:
-            plans = (make_plan(options.seed + n) for n in range(options.digests))
+            plans = (plan_of(options.seed + n) for n in range(options.digests))
             for line in pool.map(digest, plans):
                 print(line, flush=True)
         return 0
     within_s = options.within * 60
-    return min(1, explore(options.seed, options.hours, options.workers, within_s, options.plans))
+    workers, plans = options.workers, options.plans
+    return min(1, explore(options.seed, options.hours, workers, within_s, plans, plan_of))
 
 
 if __name__ == "__main__":

@@ -116,7 +116,7 @@ class Run:
         self.witness = Witness(plan["config"])
         self.pose = PoseWitness(plan["config"])
         self.spread, self.log_lines = Spread(self.witness), LogLines()
-        self.reports, self.echo, self.damage = Reports(), Echo(), Damage()
+        self.reports, self.echo, self.damage = Reports(), Echo(), Damage(plan["config"])
         self._asked_ns: int | None = None  # the daemon asked the board for its name
         self.half_duplex = HalfDuplex()
         self.followed, self.course = Followed(self.witness), Course(self.witness)
@@ -124,7 +124,7 @@ class Run:
         self.causes = Causes()
         self.counts: Counter[str] = self.witness.counts
         self.liveness = Liveness(self)
-        self.plugging = Plugging(self.witness.period_ns)
+        self.plugging = Plugging(self.witness)
         self.reasons = Reasons(self)
         self.inputs = Inputs(self.witness, bool(kinds(plan)))
         self.failure: BrokenError | None = None
@@ -705,7 +705,8 @@ class Run:
         self.inputs.fed(at_ns, data)
         lines, end, rest = (self._rest + data).rpartition(b"\n")
         self._rest = rest[-99:]
-        if not end or not any(line[:2] in (b"ap", b"an") for line in lines.split(b"\n")):
+        starts = self.product.reply_starts
+        if not end or not any(line.startswith(starts) for line in lines.split(b"\n")):
             return  # The line has no end, or begins with noise, or the board greets.
         true_ns = at_ns - START_NS + self.slept_ns
         gap_ns = true_ns - self._fed_ns

@@ -19,7 +19,7 @@ from typing import Any
 
 from tests.simulate.ages import MARGIN_NS
 from tests.simulate.product import StepResult
-from tests.simulate.promises import LINE, ZERO, BrokenError, Witness
+from tests.simulate.promises import ZERO, BrokenError, Witness
 from tests.simulate.roads import NS
 
 Plan = dict[str, Any]
@@ -647,7 +647,8 @@ class Inputs:
     def _moving(self, lines: list[tuple[int, bytes]]) -> list[tuple[float, ...]]:
         """Return the wheel speeds of each line that moves a wheel."""
         speeds = []
-        for match in filter(None, (LINE.match(line) for _, line in lines)):
+        pattern = self._witness.line_pattern
+        for match in filter(None, (pattern.match(line) for _, line in lines)):
             motors = [float(g[1:]) * (1 if g[:1] == b"p" else -1) for g in match.groups()]
             speeds.append(tuple(motors[place] * sign for place, sign in self._witness.motors))
         return [wheels for wheels in speeds if any(wheels)]

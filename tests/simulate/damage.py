@@ -1,17 +1,17 @@
 """The promise that the daemon soon decodes lines again after damaged ones.
 
-A line is whole if it contains the four speeds and nothing else. After a damaged line the daemon may
-lose two whole lines, because it must find the line ends again.
+A line is whole if it contains the speed of each motor and nothing else. After a damaged line the
+daemon may lose two whole lines, because it must find the line ends again.
 """
 
 from __future__ import annotations
 
 import re
 from collections.abc import Callable
+from typing import Any
 
 from tests.simulate.promises import BrokenError
-
-WHOLE = re.compile(rb"a[pn]\d\d\.\d\d,b[pn]\d\d\.\d\d,c[pn]\d\d\.\d\d,d[pn]\d\d\.\d\d(?:, *)?\r?")
+from tests.simulate.wiring import line_pattern
 
 LOST = 2
 """Whole lines behind a damaged one that the daemon need not hear."""
@@ -29,7 +29,8 @@ MAX_LINE = 4096
 class Damage:
     """The lines that the board sent, and how many whole ones followed the last damaged one."""
 
-    def __init__(self) -> None:
+    def __init__(self, config: dict[str, Any]) -> None:
+        self._line = re.compile(line_pattern(config).pattern + rb"(?:, *)?\r?")
         self.forget()
 
     def forget(self) -> None:
@@ -47,7 +48,7 @@ class Damage:
         """Add bytes of the board that reached the daemon."""
         *ends, rest = (self._held + data).split(b"\n")
         for line in ends:
-            if WHOLE.fullmatch(line):
+            if self._line.fullmatch(line):
                 self._whole += self._whole >= 0
             elif line not in (b"", b"\r") and not line.startswith(b"!status "):
                 self._whole, self._counted, self._short_ns = 0, None, None

@@ -11,7 +11,7 @@ import itertools
 import random
 from typing import Any
 
-from tests.simulate import bad_moments, board_inputs, gyro_faults
+from tests.simulate import bad_moments, board_inputs, gyro_faults, wiring
 from tests.simulate.product import problems
 
 Plan = dict[str, Any]
@@ -51,6 +51,15 @@ LIES = (
     "bias", "swapped_motors", "swapped_encoders", "late_watchdog", "no_watchdog",
 )  # fmt: skip
 
+TWO_WHEELS, OTHER_LETTERS = 0.25, 0.1
+"""Share of the plans with two wheels, and of those whose four motors have other letters."""
+
+OF_A_MOTOR = {
+    "stuck_encoder", "frozen_encoder", "dead_motor", "reversed_motor", "reversed_encoder", "bias",
+    "runaway",
+}  # fmt: skip
+OF_TWO_MOTORS = {"swapped_motors", "swapped_encoders"}
+
 DIALECTS = (
     "unpadded", "spaces", "trailing_comma", "no_sample", "no_check", "plain_only",
     "watchdog_fed_by_bad_lines",
@@ -58,8 +67,11 @@ DIALECTS = (
 """Other forms of the protocol, to which a board may change while it runs."""
 
 
-def make_plan(seed: int, seconds: float | None = None) -> Plan:
-    """Return the plan of this seed."""
+def make_plan(seed: int, seconds: float | None = None, wheels: int | None = None) -> Plan:
+    """Return the plan of this seed, whose robot has so many wheels if their number is given.
+
+    A plan with two wheels, or with other letters, has all else of the one with four.
+    """
     dice = random.Random(f"plan {seed}")
     share = dice.choice((0.2, 0.5, 0.7))
     kinds = sorted(kind for kind in KINDS if dice.random() < share)
@@ -110,7 +122,43 @@ def make_plan(seed: int, seconds: float | None = None) -> Plan:
         if "unstamped zeros" in later:
             senders = plan["senders"][1:] if driven else plan["senders"]
             _draw_unstamped_zeros(random.Random(f"unstamped zeros {seed}"), senders)
+    dice = random.Random(f"wheels {seed}")
+    chance = dice.random()
+    if wheels == 2 or (wheels is None and chance < TWO_WHEELS):
+        _leave_two_wheels(dice, plan)
+    elif wheels is None and chance < TWO_WHEELS + OTHER_LETTERS:
+        mcu, letters = plan["config"]["mcu"], sorted(dice.sample(wiring.LETTERS, 4))
+        motors = wiring.wheels(plan["config"]).items()
+        mcu["wheels"] = {name: m[0] + letters["abcd".index(m[1])] for name, m in motors}
     return plan
+
+
+def _leave_two_wheels(dice: random.Random, plan: Plan) -> None:
+    """Leave the robot one motor on each side. It takes over the faults of the two motors there."""
+    before, letters = wiring.wheels(plan["config"]), dice.sample(wiring.LETTERS, 2)
+    after = {
+        name: dice.choice("+-") + letter for name, letter in zip(wiring.TWO, letters, strict=True)
+    }
+    plan["config"]["mcu"]["wheels"] = after
+    motor_of = {
+        "abcd".index(motor[1]): sorted(letters).index(after[name.rpartition("_")[2]][1])
+        for name, motor in before.items()
+    }
+    events: list[dict[str, Any]] = []
+    for event in plan["events"]:
+        match event:
+            case {"do": "board", "fault": [name, motor, *more]} if name in OF_A_MOTOR:
+                event["fault"] = [name, motor_of[motor], *more]
+                if event in events:
+                    continue
+            case {"do": "board", "fault": [name, motor, _]} if name in OF_TWO_MOTORS:
+                event["fault"] = [name, motor_of[motor], 1 - motor_of[motor]]
+            case {"do": "flip", "place": place}:
+                event["place"] = place % 16  # of the two speeds
+            case {"do": "tear", "taken": taken}:
+                event["taken"] = taken // 2
+        events.append(event)
+    plan["events"] = events
 
 
 def _draw_low_bound(dice: random.Random, config: dict[str, Any]) -> None:

@@ -31,6 +31,7 @@ from tests.simulate import board_inputs
 from tests.simulate.actors import REPLAYED, played
 from tests.simulate.plan import Plan, make_plan
 from tests.simulate.planted_faults import CASES, FAULTS, Fault
+from tests.simulate.wiring import wheels
 
 ROOT = Path(__file__).parents[2]
 TABLE = Path(__file__).with_name("PLANTED.md")
@@ -143,6 +144,7 @@ def kinds(plan: Plan) -> set[str]:
     """Return the kinds of a plan, by which `Fault.kind` chooses it."""
     names = board_inputs.kinds(plan) | {plan.get("moment", "")}
     names |= {"recorded"} if plan["seed"] % REPLAYED == 0 else set()
+    names |= {"two wheels"} if len(wheels(plan["config"])) == 2 else set()
     for event in plan["events"]:
         names |= {*event, event["do"], *event.get("fault", ())[:1]}
         names |= {key.partition(".")[0] for key in event.get("settings", ())}

@@ -38,6 +38,7 @@ PLANS_OF_FAULT = {
     "robot unsent": "block", "robot limits": "limits", "lifecycle number": "typed",
     "lifecycle fault": "driver_fault", "ages echo": "queue from the start",
     "gyro hangs": "hangs", "odometry still": "mute", "arbiter silence": "long silence",
+    "two": "two wheels",
 }  # fmt: skip
 """Kinds of plans by the name of a fault, or by the first word of its name."""
 
@@ -55,7 +56,7 @@ class Fault(NamedTuple):
         """The kind of plans that can find the fault, or "" for all plans.
 
         It is a kind of inputs, an event or one of its values, a fault of the board, a table of
-        settings that a call changes, a moment of `bad_moments.py`, or "recorded".
+        settings that a call changes, a moment of `bad_moments.py`, "recorded" or "two wheels".
         """
         first = self.name.split()[0]
         return PLANS_OF_FAULT.get(self.name) or PLANS_OF_FAULT.get(first, "")
@@ -434,6 +435,13 @@ FAULTS = (
           "core/link/board_counts.py", "MAX_DIFFERENCE = 0.2 ", "MAX_DIFFERENCE = 20.0 "),
     fault("gyro hangs", "a gyro that repeats one rate is believed", GYRO,
           "self.hangs |= share < MAX_REPEATING and", "self.hangs |= share < 0.0 and"),
+    # two driven wheels
+    fault("two rear", "of two wheels, each rear one turns like the wheel of the other side", CODEC,
+          "[*motor_of, *motor_of[::-1]]", "[*motor_of, *motor_of]"),
+    fault("two names", "of two wheels, one that does not turn is named like one of four", VALUES,
+          "WHEELS if count == len(WHEELS) else TWO_WHEELS", "WHEELS[:count]"),
+    fault("two counts", "replies of two motors with their counts are not read",
+          "core/link/checked_line.py", "{20}|[0-9A-F]{12}))?", "{20}))?"),
     # recording
     fault("replay clock", "the pose depends on a clock that the inputs do not have", ODOMETRY,
           "        self.travelled += abs(distance)\n", "        self.travelled += abs(distance)\n"

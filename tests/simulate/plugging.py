@@ -6,7 +6,7 @@ Times are in ns of the robot's monotonic clock, which stops while the host sleep
 from __future__ import annotations
 
 from tests.simulate.product import Product, StepResult
-from tests.simulate.promises import LINE, BrokenError
+from tests.simulate.promises import BrokenError, Witness
 from tests.simulate.roads import NS
 
 SEEN_NS = 20_000_000
@@ -23,8 +23,8 @@ PERIODS = 2
 class Plugging:
     """Judges the daemon's link state and lines when the board is unplugged or plugged in."""
 
-    def __init__(self, period_ns: int) -> None:
-        self._period_ns = period_ns
+    def __init__(self, witness: Witness) -> None:
+        self._period_ns, self._line_pattern = witness.period_ns, witness.line_pattern
         self._judged_ns = -1
         """The plugging of which the first line was judged."""
         self._line_ns = -1
@@ -52,7 +52,7 @@ class Plugging:
         for at_ns, line in snapshot.lines:
             if at_ns >= plugged_ns and line.endswith(b"\n"):
                 self._judged_ns = plugged_ns
-                match = LINE.match(line)
+                match = self._line_pattern.match(line)
                 if match is not None and any(float(speed[1:]) for speed in match.groups()):
                     text = f"{line!r} is the first line after the board was plugged in"
                     raise BrokenError("the first line is a zero", true_ns, text)

@@ -10,6 +10,7 @@ from typing import Any
 from tests.simulate.gyro_faults import GYRO_BIAS, GyroFaults
 from tests.simulate.promises import BrokenError
 from tests.simulate.roads import NS
+from tests.simulate.wiring import wheels
 
 LIARS = {
     "bias", "stuck_encoder", "frozen_encoder", "reversed_encoder", "reversed_motor", "dead_motor",
@@ -104,7 +105,9 @@ class PoseWitness:
         self._unsure_m: float = turn * drive.get("wheel_radius", 0.05)
         """Distance that such encoders may be off, m."""
         rate = config.get("control", {}).get("rate", 100.0)
-        self._per_flip_m = self.fastest / 2 / (100.0 if rate == "auto" else rate)
+        # Two wheels are only judged by twice as much: a damaged speed is that of its whole side.
+        of_side = len(wheels(config)) / 2
+        self._per_flip_m = self.fastest / of_side / (100.0 if rate == "auto" else rate)
         """Distance by which one damaged speed of one line may move the pose, m."""
         self._known_ns = 0
         """From when on the lines show the motion again."""

@@ -232,6 +232,9 @@ class Product:
 
     def __init__(self, config: dict[str, Any], see: Callable[[StepResult], None]) -> None:
         self._config, self._see = parse(b"", config), see
+        first = self._config.mcu.wheels.letters[0].encode()
+        self.reply_starts = first + b"p", first + b"n"
+        """The first bytes of a reply with speeds."""
         self._faults: list[tuple[str, tuple[Any, ...]]] = []
         self._lasting = ExitStack()
         self.disk = Disk()
@@ -461,7 +464,8 @@ class Product:
             if name == "replies_twice":
                 self._reply_twice(mcu)
             if name == "gain":
-                self._lasting.enter_context(mcu.switched(partial(replace, drives=(values[0],) * 4)))
+                drives = (values[0],) * len(mcu.letters)
+                self._lasting.enter_context(mcu.switched(partial(replace, drives=drives)))
         self._run_away(mcu, [values[0] for name, values in faults if name == "runaway"])
 
     def _garble(self, mcu: FakeMcu, baud_rate: int) -> None:
@@ -526,7 +530,7 @@ class Product:
 
         def twice(at_ns: int, data: bytes) -> None:
             send(mcu, at_ns, data)
-            if data[:2] in (b"ap", b"an"):
+            if data.startswith(self.reply_starts):
                 send(mcu, at_ns, data)
 
         vars(mcu)["_send"] = twice
@@ -542,7 +546,7 @@ class Product:
 
         def flipped(at_ns: int, data: bytes) -> None:
             nonlocal left
-            speeds = data[:2] in (b"ap", b"an")
+            speeds = data.startswith(self.reply_starts)
             left -= speeds
             if speeds and left < 0:
                 vars(mcu).pop("_send", None)

@@ -11,7 +11,6 @@ Times are true ns from the start. True time continues while the robot's clock st
 from __future__ import annotations
 
 import itertools
-import re
 from bisect import bisect_right
 from collections import Counter, deque
 from typing import Any, get_args
@@ -20,8 +19,7 @@ from acsard.core.codes import GUARD_CODES, FaultCode, LinkCode, StopCode, WaitCo
 from tests.simulate.ages import MARGIN_NS, Ages, Sender, Wish
 from tests.simulate.jerk import STEP, Slope
 from tests.simulate.roads import NS, Message, Sample
-
-LINE = re.compile(rb"a([pn]\d\d\.\d\d),b([pn]\d\d\.\d\d),c([pn]\d\d\.\d\d),d([pn]\d\d\.\d\d)")
+from tests.simulate.wiring import letters, line_pattern, wheels
 
 ZERO = (0.0, 0.0, 0.0, 0.0)
 RESTING = {*get_args(WaitCode), "no_command"} - {"nothing", "command", "senders"}
@@ -115,13 +113,16 @@ class Witness:
         self.half = (
             drive.get("wheel_separation", 0.3) * drive.get("wheel_separation_multiplier", 1.0) / 2
         )
-        wheels = config["mcu"].get("wheels") or {
-            "front_right": "+a", "front_left": "+b", "rear_left": "+c", "rear_right": "+d",
-        }  # fmt: skip
-        self.motors = [
-            ("abcd".index(wheels[w][1]), -1 if wheels[w][0] == "-" else 1)
-            for w in ("front_right", "front_left", "rear_left", "rear_right")
+        self.line_pattern, self._letters = line_pattern(config), letters(config)
+        driven = [
+            (name, self._letters.index(motor[1]), -1 if motor[0] == "-" else 1)
+            for name, motor in wheels(config).items()
         ]
+        if len(driven) == 2:
+            driven += driven[::-1]
+        self.names = [name for name, *_ in driven]
+        """Name of each of the four wheels, and then the number and the sign of its motor."""
+        self.motors = [(motor, sign) for _, motor, sign in driven]
         self.file = dict(config["limits"])
         self.limits = dict(config["limits"])
         commands = config["commands"]
@@ -612,11 +613,11 @@ class Witness:
 
     def _read(self, at_ns: int, line: bytes) -> tuple[float, ...] | None:
         """Return the wheel speeds of a line, None for a question to the board or a torn line."""
-        match = LINE.match(line)
+        match = self.line_pattern.match(line)
         if match is not None and not line.endswith(b"\n"):
             return None  # only its end is missing: the board may obey it, and the daemon says no
         if match is None:
-            if line.endswith(b"\n") and line[:1] in b"abcd#":
+            if line.endswith(b"\n") and line[:1] in (self._letters + "#").encode():
                 raise BrokenError("every line is whole", at_ns, repr(line))
             return None
         motors = [float(g[1:]) * (1 if g[:1] == b"p" else -1) for g in match.groups()]

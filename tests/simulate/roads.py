@@ -16,6 +16,8 @@ from typing import Any, NamedTuple
 
 import msgspec
 
+from tests.simulate import wiring
+
 NS = 1_000_000_000
 ECHOING = ("client", "page")
 """Ways of the programs that copy the newest beat into each command."""
@@ -261,6 +263,8 @@ def _payload(
     options: dict[str, Any],
 ) -> tuple[str, bytes]:
     kind = "wheel_cmd" if sender["wheels"] and via == "native" else "cmd"
+    if message.junk == "cancels" and len(wiring.wheels(config)) == 2:
+        kind = "cmd"  # each speed of two wheels moves the robot
     key, v, w = f"{kind}/{sender['source']}", message.v, message.w
     match message.junk:
         case "garbage":
@@ -335,9 +339,9 @@ def _wheels(config: dict[str, Any], v: float, w: float, cancels: bool) -> bytes:
     half = w * track / 2
     left = (v - half) / (radius * drive.get("left_wheel_radius_multiplier", 1.0))
     right = (v + half) / (radius * drive.get("right_wheel_radius_multiplier", 1.0))
-    speeds = [1.0, -1.0, 1.0, -1.0] if cancels else [right, left, left, right]
-    sides = ("front_right", "front_left", "rear_left", "rear_right")
-    names = [f"{side}_wheel_joint" for side in sides]
+    wheels = wiring.wheels(config)
+    speeds = ([1.0, -1.0, 1.0, -1.0] if cancels else [right, left, left, right])[: len(wheels)]
+    names = [f"{wheel}_wheel_joint" for wheel in wheels]
     # msgpack says NaN, JSON does not.
     return msgspec.msgpack.encode({"name": names, "velocity": speeds})
 

@@ -14,6 +14,7 @@ from tests.simulate.actors import Run, digest
 from tests.simulate.board_inputs import kinds
 from tests.simulate.plan import KINDS, LATER_KINDS, make_plan
 from tests.simulate.product import problems
+from tests.simulate.wiring import letters, wheels
 
 
 @pytest.mark.slow
@@ -32,5 +33,7 @@ def test_every_plan_is_legal_and_every_kind_of_trouble_is_drawn() -> None:
     assert {kind for plan in plans for kind in kinds(plan)} == {
         "estop", "stop", "away", "battery", "driver_fault"
     }  # fmt: skip
+    assert {len(wheels(plan["config"])) for plan in plans} == {2, 4}
+    assert {letters(plan["config"]) == "abcd" for plan in plans} == {True, False}
     lawful = sum(bool(Run(plan).liveness.lawful) for plan in plans if "moment" not in plan)
     assert lawful > 20

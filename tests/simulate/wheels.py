@@ -9,11 +9,11 @@ command of that time must be stopped, too. `state` must name a wheel that does n
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Callable
 from typing import Any, get_args
 
 from acsard.core.codes import FaultCode
-from acsard.core.values import WHEELS
 from tests.simulate.promises import BrokenError, Witness
 from tests.simulate.roads import NS
 
@@ -132,7 +132,7 @@ class Wheels:
         self._missed[place] = 0.0
         self._witness.counts["wheels named"] += 1
         text = self._state()["wheel_fault"]
-        if f"{WHEELS[place]} wheel is blocked" not in text:
+        if not re.search(rf"\b{self._witness.names[place]} wheel is blocked", text):
             raise BrokenError("a wheel that does not turn is named", at_ns, f"{place}: {text!r}")
 
     def _stuck(self, at_ns: int, place: int, seconds: float, speed: float) -> None:
@@ -142,9 +142,9 @@ class Wheels:
             return
         self._missed[place] = 0.0
         self._witness.counts["wheels stuck"] += 1
-        text = self._state()["wheel_fault"]
-        if f"{WHEELS[place]} wheel" not in text:
-            raise BrokenError("a stuck encoder is named", at_ns, f"{WHEELS[place]}: {text!r}")
+        text, name = self._state()["wheel_fault"], self._witness.names[place]
+        if not re.search(rf"\b{name} wheel", text):
+            raise BrokenError("a stuck encoder is named", at_ns, f"{name}: {text!r}")
 
     def _too_fast(self, at_ns: int, slowest: float) -> None:
         """Check that a robot all of whose wheels are too fast is stopped."""
