@@ -40,8 +40,9 @@ STANDS = 0.001
 """Distance, m, and turn, rad, up to which the true pose has stayed the same."""
 
 VAGUE = 0.05
-"""Variance, m2, from which on a gap may be lost in it. After a gap that is too long to be filled,
-the pose stays where it was, but the covariance turns with a heading that is nearly unknown."""
+"""Variance, m2 or rad2, from which on a gap may be lost in it. After a gap that is too long to be
+filled, the pose stays where it was, but the covariance turns with a heading that is nearly
+unknown."""
 
 FRESH_NS = NS // 50
 """Age of a sample up to which the present pose stands for that at the sample. Behind a gap nothing
@@ -105,8 +106,10 @@ class PoseWitness:
         self._unsure_m: float = turn * drive.get("wheel_radius", 0.05)
         """Distance that such encoders may be off, m."""
         rate = config.get("control", {}).get("rate", 100.0)
-        # Two wheels are only judged by twice as much: a damaged speed is that of its whole side.
-        of_side = len(wheels(config)) / 2
+        # The judge is weaker for two wheels in two places, both after a damaged speed, which no
+        # second wheel of its side halves or contradicts: here, and in the heading of a gap.
+        self._alone = len(wheels(config)) == 2
+        of_side = 1 if self._alone else 2
         self._per_flip_m = self.fastest / of_side / (100.0 if rate == "auto" else rate)
         """Distance by which one damaged speed of one line may move the pose, m."""
         self._known_ns = 0
@@ -382,6 +385,10 @@ class PoseWitness:
         if not stood or self._drifts:
             return
         turned = abs(math.remainder(eyaw - pose[2], math.tau))
+        if self._alone and yaw_variance > VAGUE:
+            # A damaged speed behind an earlier gap has turned the pose, and one the other way turns
+            # it back, which makes the covariance smaller.
+            yaw_variance = 0.0
         sigma = math.sqrt(max(0.0, yawyaw - yaw_variance))
         if turned > SIGMAS * sigma + ROOM_RAD:
             text = f"{turned:.3f} rad in {(sampled_ns + offset_ns - then_ns) / NS:.3f} s"
