@@ -13,7 +13,14 @@ from acsard.core.config.settings import OdometryConfig, WheelMap
 from acsard.core.link.feedback import Line
 from acsard.core.motion.gaps import Rolled, Skipped, rolled_over
 from acsard.core.motion.gyro import Gyro, Turn
-from acsard.core.values import Estimate, Instant, Pose, Twist, WheelSpeeds
+from acsard.core.values import (
+    STILL,
+    Estimate,
+    Instant,
+    Pose,
+    Twist,
+    WheelSpeeds,
+)
 from tests.each import each
 from tests.unit.odometer import Odometer
 from tests.vectors.drive import PATHS, SEED_STEP, SEED_STEP_ARC, SEED_STEP_TWIST
@@ -193,6 +200,25 @@ def test_a_robot_that_obeys_is_as_certain_with_long_lines_as_with_short_ones(
 ) -> None:
     long, short = accelerated(wheels, 0.1), accelerated(wheels, 0.01)
     assert long.covariance.xx == pytest.approx(short.covariance.xx, rel=0.2)
+
+
+@each("wheels", MAPS)
+@each("silence", [0.02, 0.2, 0.9])
+def test_one_damaged_speed_behind_a_silence_is_no_fault_of_a_wheel_that_stopped(
+    wheels: WheelMap, silence: float
+) -> None:
+    robot = Odometer(wheels=wheels)
+    for _ in range(100):
+        robot.fold(line(1.0), WheelSpeeds(1.0, 1.0, 1.0, 1.0))
+    for n in range(80):
+        robot.fold(line(round(0.8**n, 2)), STILL)
+    rear = 0.0 if wheels == FOUR else 80.0  # the only wheel of a side
+    robot.fold(Line(AT, WheelSpeeds(80.0, 0.0, 0.0, rear), silence + 0.01, bridged=silence))
+    faults = [robot.checks.wheels.fault]
+    for _ in range(200):
+        robot.fold(line(0.0))
+        faults.append(robot.checks.wheels.fault)
+    assert set(faults) == {None}
 
 
 def test_gaps_and_bridged_times_are_counted_but_a_gap_at_rest_is_not() -> None:

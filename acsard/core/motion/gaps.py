@@ -53,9 +53,7 @@ def rolled_over(skipped: Skipped, line: Line, before: Wheels4, commanded: Wheels
 
     `commanded` is None if there are two wheels on a side.
     """
-    speeds = line.speeds.as_tuple()
-    if commanded is None:
-        speeds = _confirmed(before, speeds)
+    speeds = _confirmed(before, line.speeds.as_tuple())
     if line.turned is not None:
         seconds, filled, unknown, angles = line.dt, 0.0, 0.0, line.turned
     else:
@@ -78,7 +76,8 @@ def rolled_over(skipped: Skipped, line: Line, before: Wheels4, commanded: Wheels
 
 def _confirmed(before: Wheels4, after: Wheels4) -> Wheels4:
     # Motion changes both wheels of a side alike, damage one of them. In a usual line it matters
-    # little; here, take the median of each wheel, the other one of its side and its last speed.
+    # little; here, take the median of each wheel, the other one of its side and its last speed. Of
+    # two wheels, it is the reported speed: the rear one says the same.
     fr, fl, rl, rr = after
     was_fr, was_fl, was_rl, was_rr = before
     return (

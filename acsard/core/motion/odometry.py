@@ -90,7 +90,11 @@ class Odometry(Struct):
             rolled = line.by_counts or times(reported, seconds)
         # Counts are valid even after a silence: the wheels turned by them in its time, too.
         whole = seconds if line.turned is None else seconds + line.gap
-        checks.check_line(model, line, rolled, whole, known=gap is None or not gap.unknown)
+        seen = rolled
+        if gap and gap.filled and model.independent == 2 and line.turned is None:
+            # No second wheel of its side confirms a speed behind a silence, the next line does.
+            seen = times(self.speeds.as_tuple(), seconds)
+        checks.check_line(model, line, seen, whole, known=gap is None or not gap.unknown)
         turn, slips = checks.turn, checks.slips
 
         believed = wheels.believed(reported) if wheels.excludes else reported
