@@ -255,3 +255,11 @@ def test_a_computer_that_stutters_makes_no_fault_of_a_sound_wheel_with_counts(
         world.send(0.6)
         world.run(0.001 + 0.002 * (number % 7))
         assert world.state.mode != "fault", world.state.reason
+
+
+@four_and_two
+def test_two_swapped_motors_are_one_cause_whichever_wheel_shows_it(wheels: WheelMap) -> None:
+    world = World(Config(mcu=McuConfig(wheels=wheels)))
+    with world.mcu.fault("swapped_motors", 0, 1):
+        world.drive(0.0, 1.5, seconds=4.0)
+    assert [cause.code for cause in world.state.causes].count("wheels_swapped") == 1

@@ -357,7 +357,10 @@ class Wheels(Struct):
             or turning * command >= 0
         ):
             return False
-        names = f"{self.names[i]} and {self.names[ACROSS[i]]}"
+        # One cause, whichever of them shows it.
+        right, left = (i, ACROSS[i]) if SIDE_OF[i] else (ACROSS[i], i)
+        one, other = self.wheels[right], self.wheels[left]
+        names = f"{self.names[right]} and {self.names[left]}"
         figures = (
             f"(commanded {one.command:.2f} and {other.command:.2f}, "
             f"measured {one.speed:.2f} and {other.speed:.2f} rad/s)"
