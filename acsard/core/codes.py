@@ -45,8 +45,8 @@ HOST_CODES: tuple[LinkCode, ...] = ("host_late", "simulator_fault")
 
 # Causes of a latched stop.
 StopCode = Literal[
-    "stopped", "stopped_at_start", "emergency_stop", "emergency_stop_silent", "bumper",
-    "bumpers_silent", "battery_empty",
+    "stopped", "stopped_by_others", "stopped_at_start", "emergency_stop", "emergency_stop_silent",
+    "bumper", "bumpers_silent", "battery_empty",
 ]  # fmt: skip
 
 # For which the guard replaces a line; each is a defect of acsard.
@@ -165,6 +165,9 @@ other_version
     {cause} ({named})
 stopped
     stopped by {by}
+    -> look at the robot, and type `acsard call clear`
+stopped_by_others
+    stopped by {by} and maybe by others, because more clients stopped the robot than it lists
     -> look at the robot, and type `acsard call clear`
 stopped_at_start
     stopped when the daemon started, because {cause}

@@ -16,8 +16,8 @@ from tests.simulate.roads import NS
 SHOWN_NS = 2 * NS
 """A call without numbers releases nothing that has been published for less than this."""
 
-MOST = 32
-"""Causes from which on the newest stop of a client gives way to the next cause."""
+OTHERS = "stopped_by_others"
+"""Code of the cause that takes in a client's stop for which there is no place."""
 
 RELEASES = {"clear": ("fault", "stop"), "activate": ("inactive",)}
 
@@ -104,8 +104,8 @@ class Causes:
         for number in before.keys() - present.keys():
             cause = before[number]
             renewed = cause in keys or (cause.kind == "inactive" and keys)
-            displaced = len(before) >= MOST and fresh
-            if not (renewed or displaced or any(self._may(c, number, before) for c in calls)):
+            joined = cause.key[0] == "stopped" and OTHERS in [present[n].key[0] for n in fresh]
+            if not (renewed or joined or any(self._may(c, number, before) for c in calls)):
                 text = f"{cause} with number {number} is gone, and the calls were {calls}"
                 raise BrokenError("a call releases what it names, and no more", at_ns, text)
         for call in done:

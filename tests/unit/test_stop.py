@@ -13,10 +13,12 @@ from msgspec.structs import replace
 from acsard.core.codes import Reason, reason
 from acsard.core.motion.latches import (
     MAX_CAUSES,
+    OTHERS,
     after_restart,
     describe,
     in_force,
     latched,
+    released,
     stopped,
 )
 from acsard.core.motion.lifecycle import Lifecycle
@@ -62,16 +64,33 @@ def test_the_same_cause_renews_its_number_and_is_there_once() -> None:
     assert latches.causes[2].at_ns == WALL_NS + 1
 
 
-def test_of_too_many_causes_the_newest_stop_of_a_client_goes() -> None:
+def test_no_stop_is_forgotten_if_more_clients_stop_the_robot_than_it_lists() -> None:
     latches = latched(Latches(), "fault", dead("front_left"), WALL_NS)
     for number in range(100):
-        latches = stopped(latches, f"client{number}", WALL_NS)
+        before, latches = latches, stopped(latches, f"client{number}", WALL_NS)
+        # A clear of all that was shown before a stop does not free the robot.
+        assert len(released(latches, numbers(before)).causes) == 1
     assert len(latches.causes) == MAX_CAUSES == 32
-    shown = [latches.causes[place].by for place in (0, 1, -2, -1)]
-    assert shown == ["", "client0", "client29", "client99"]
+    assert [latches.causes[place].by for place in (0, 1, -2)] == ["", "client0", "client29"]
+    others = latches.causes[-1]
+    assert (others.code, others.kind, others.number) == (OTHERS, "stop", latches.last)
     latches = latched(latches, "stop", FLAT, WALL_NS)
-    assert [latches.causes[place].code for place in (0, -1)] == ["wheel_reversed", "battery_empty"]
-    assert latches.last == 102
+    assert [cause.code for cause in latches.causes[-2:]] == ["battery_empty", OTHERS]
+    assert len(latches.causes) == MAX_CAUSES
+    assert latches.causes[-1].number > others.number  # the stop of `client29` is in it now
+    assert "client29" in latches.causes[-1].text
+
+
+def test_a_stop_in_the_last_place_is_repeated_and_answered_like_another() -> None:
+    timed = Timed()
+    for number in range(40):
+        timed.stop(f"client{number}")
+        timed.run(0.02)
+    (number,) = timed.life.stop_of("client39")
+    timed.life.stop("client39", timed.life.stop_asked_ns, at(timed.now_s))
+    assert timed.life.stop_of("client39") == (number,) == (timed.life.latches.last,)
+    timed.life.stop("client50", timed.life.stop_asked_ns - 1, at(timed.now_s))
+    assert timed.life.stop_of("client50") > (number,)
 
 
 # the life of a robot

@@ -10,9 +10,12 @@ from acsard.core.codes import Reason, reason
 from acsard.core.formatting import utc
 from acsard.core.values import Cause, CauseKind, Latches, WallNs
 
-# A flood of stops by many clients must not fill the memory. If there are as many, the newest stop
-# of a client gives way to the next cause: the first clients and all other causes stay.
+# A flood of stops by many clients must not fill the memory, and no stop may be forgotten. The last
+# place is one cause, with a new number for each further stop: a `clear` that was shown an older
+# number does not release it.
 MAX_CAUSES = 32
+
+OTHERS = "stopped_by_others"
 
 NAMELESS = "request"  # in a text, a client that has no name
 
@@ -22,11 +25,14 @@ def latched(
 ) -> Latches:
     """Return the latches with a new cause, which replaces an equal one: a caller has one stop."""
     new = Cause(latches.last + 1, kind, why.code, why.text, why.part, by, wall_ns)
-    causes = [cause for cause in latches.causes if not _equal(cause, new)]
-    if len(causes) >= MAX_CAUSES:
-        of_clients = [cause for cause in causes if cause.kind == "stop" and cause.by]
-        causes.remove((of_clients or causes)[-1])
-    return Latches((*causes, new), new.number)
+    causes = [*[cause for cause in latches.causes if not _equal(cause, new)], new]
+    named = [cause for cause in causes if cause.code != OTHERS]
+    by_clients = [cause for cause in named if cause.code == "stopped"]
+    if len(named) < MAX_CAUSES or not by_clients:
+        return Latches(tuple(causes), new.number)
+    named.remove(by_clients[-1])
+    why, number = reason(OTHERS, by=by_clients[-1].by or NAMELESS), new.number + 1
+    return Latches((*named, Cause(number, "stop", why.code, why.text, at_ns=wall_ns)), number)
 
 
 def stopped(latches: Latches, by: str, wall_ns: WallNs) -> Latches:
@@ -82,4 +88,4 @@ def _alone(cause: Cause) -> str:
 
 
 def _asked_for(cause: Cause) -> bool:
-    return cause.code in ("stopped", "switched_off")  # by a client
+    return cause.code in ("stopped", OTHERS, "switched_off")  # by a client

@@ -17,6 +17,7 @@ from msgspec import Struct
 from acsard.core.codes import Reason, reason
 from acsard.core.motion.latches import (
     NAMELESS,
+    OTHERS,
     describe,
     in_force,
     is_latched,
@@ -105,17 +106,22 @@ class Lifecycle(Struct):
         A repetition changes nothing: this client's stop is latched, and an accepted stop arrived at
         `asked_ns` or later.
         """
-        if asked_ns > self.stop_asked_ns or not self.stop_of(by):
+        # A query of `srv/stop` arrives as two, so the stop of further clients may be its own.
+        newest = asked_ns == self.stop_asked_ns
+        if asked_ns > self.stop_asked_ns or not self.stop_of(by, or_others=newest):
             self.stop_asked_ns = max(self.stop_asked_ns, asked_ns)
             self._use(stopped(self.latches, by, now.wall_ns))
         if self.shutting_down:
             return f"stopped and latched; {SHUTDOWN_REASON.text}"
         return "stopped and latched; `acsard call clear` releases it"
 
-    def stop_of(self, by: str) -> tuple[int, ...]:
-        """Return the number of a client's stop, or ()."""
-        causes = self.latches.of("stop")
-        return tuple([c.number for c in causes if (c.code, c.by) == ("stopped", by)])
+    def stop_of(self, by: str, *, or_others: bool = True) -> tuple[int, ...]:
+        """Return the number of a client's stop, else of that of further clients, or ()."""
+        stops = self.latches.of("stop")
+        own = tuple([c.number for c in stops if (c.code, c.by) == ("stopped", by)])
+        if own or not or_others:
+            return own
+        return tuple([c.number for c in stops if c.code == OTHERS])
 
     def clear(self, numbers: Collection[int] | None, asked_ns: Ns) -> tuple[str, tuple[int, ...]]:
         """Release the named causes; return a text and the numbers released.
