@@ -17,7 +17,7 @@ from msgspec.structs import replace
 # For which `core/motion/ages.py` refuses a command.
 AgeCode = Literal[
     "no_echo", "other_run", "from_future", "too_old", "round_trip", "not_newer", "stalled",
-    "unproven", "early", "stale", "set_back", "stamps",
+    "unproven", "early", "stale", "set_back", "stamps", "too_many_clocks",
 ]  # fmt: skip
 
 ObjectionCode = Literal["unknown_source", "not_finite", "too_many_senders"]
@@ -134,6 +134,10 @@ stamps
     the stamps of {source} do not advance with time ({note});
     -> is use_sim_time on, or are the stamps copied from another message? Send the time of the
     command, or no stamp
+too_many_clocks
+    a new sender of {source} is refused, because the commands of 16 others came too late, which the
+    daemon remembers for an hour;
+    -> check their network, or type `acsard call activate`, which forgets them
 stalled
     the daemon stalled: waiting for the next command of {source}
 neutral

@@ -237,6 +237,28 @@ def test_a_flood_of_new_clocks_does_not_push_out_a_clock_that_counts() -> None:
     assert sender.hear(1060, 1060) == ""
 
 
+def test_no_number_of_short_publishers_makes_a_known_queue_new() -> None:
+    sender, at_ms = Sender(1000), 1000
+    for number in range(500):
+        for _ in range(12):  # each is prompt, and drives after one timeout
+            at_ms += 50
+            assert sender.hear(at_ms - 1, at_ms - 3001) in ("stale", "set_back")
+            verdict = sender.hear(at_ms, at_ms, f"publisher {number}")
+        assert verdict == ""
+    assert len(sender.ages.clocks) == MAX_CLOCKS
+
+
+def test_a_table_full_of_refused_clocks_refuses_a_new_one_until_it_forgets_them() -> None:
+    sender = Sender()
+    names = [f"clock {number}" for number in range(MAX_CLOCKS)]
+    for at_ms in range(0, 1001, 50):
+        verdicts = [sender.hear(at_ms, at_ms, name) for name in names]
+    assert verdicts == [""] * MAX_CLOCKS
+    assert {sender.hear(5000, 2000, name) for name in names} == {"stale"}
+    assert sender.hear(5050, 5050, "new") == "too_many_clocks"
+    assert sender.hear(3_605_050, 3_605_050, "new") == "unproven"  # an hour later
+
+
 def test_stamps_that_stand_still_for_a_timeout_are_refused_until_two_seconds_later() -> None:
     sender = Sender(1000)
     verdicts = [sender.hear(1050 + 50 * n, 1050) for n in range(8)]

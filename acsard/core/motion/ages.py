@@ -26,7 +26,9 @@ RISE_DIVISOR = 2000
 # The least delay rises by at most one timeout in any hour: its lowest values in slots limit it.
 MEMORY_NS, SLOT_NS = 3600 * NS_PER_S, 600 * NS_PER_S
 
-MAX_CLOCKS = 16  # of a source
+# Of a source. A full table never forgets a refusal: it drops a clock that is not proven, else the
+# one that was silent longest and was not refused since its last accepted command, else none.
+MAX_CLOCKS = 16
 
 LASTING_NS = 2 * NS_PER_S  # refusals for this time are no passing state, and their cause is named
 
@@ -87,7 +89,6 @@ class Clock(Struct):
     lows: list[int] = []  # lowest `least` of the last slots
     slot_ns: Ns = 0  # begin of the last slot
     accepted_ns: Ns = 0  # stamp of the last accepted command
-    used_ns: Ns = 0  # arrival of the last accepted command
     low: int = 0  # lowest delay of a proof
     since_ns: Ns | None = None  # a proof runs, in which the delay has not fallen since then
     first_refused: tuple[Ns, Ns] | None = None  # arrival and stamp of the first refused command
@@ -111,12 +112,17 @@ class Clock(Struct):
             verdict = "not_newer"
         if verdict:
             return self._lasting(verdict, at_ns, stamp_ns)
-        self.accepted_ns, self.used_ns, self.first_refused, self.cause = stamp_ns, at_ns, None, ""
+        self.accepted_ns, self.first_refused, self.cause = stamp_ns, None, ""
         self.least = delay if self.least is None else min(self.least, delay)
         if not self.lows or at_ns - self.slot_ns >= SLOT_NS:
             self.lows, self.slot_ns = [*self.lows[-(MEMORY_NS // SLOT_NS) :], self.least], at_ns
         self.lows[-1] = min(self.lows[-1], self.least)
         return ""
+
+    def may_go(self, now_ns: Ns) -> bool:
+        """Return whether the clock shows nothing that must be remembered."""
+        refused = self.least is not None and self.first_refused is not None
+        return not refused or now_ns - self.at_ns > MEMORY_NS
 
     def _risen(self, at_ns: Ns, timeout_ns: Ns) -> int | None:
         if self.least is None or not self.lows:
@@ -173,6 +179,8 @@ class Ages(Struct):
             verdict = last.judge_echo(command, timeout_ns)
         elif command.stamp_ns is not None:
             clock = self._clock(command.clock, command.arrived_ns, command.stamp_ns)
+            if clock is None:
+                return "too_many_clocks"
             verdict = clock.judge_stamp(command.arrived_ns, command.stamp_ns, timeout_ns)
             if not verdict and last.overtook(command, timeout_ns):
                 verdict = "not_newer"
@@ -185,11 +193,16 @@ class Ages(Struct):
             last.accept(command)
         return verdict
 
-    def _clock(self, name: str, at_ns: Ns, stamp_ns: Ns) -> Clock:
+    def _clock(self, name: str, at_ns: Ns, stamp_ns: Ns) -> Clock | None:
         clock = self.clocks.get(name)
         if clock is None or at_ns - clock.at_ns > MEMORY_NS:
             if clock is None and len(self.clocks) >= MAX_CLOCKS:
-                del self.clocks[min(self.clocks, key=lambda other: self.clocks[other].used_ns)]
+                sound = {n: other for n, other in self.clocks.items() if other.may_go(at_ns)}
+                if not sound:
+                    return None
+                del self.clocks[
+                    min(sound, key=lambda n: (sound[n].least is not None, sound[n].at_ns))
+                ]
             clock = self.clocks[name] = Clock(at_ns, stamp_ns, at_ns)
         return clock
 

@@ -6,7 +6,7 @@ from collections.abc import Collection, Sequence
 
 from msgspec.structs import replace
 
-from acsard.core.codes import Reason, reason
+from acsard.core.codes import Reason, StopCode, reason
 from acsard.core.formatting import utc
 from acsard.core.values import Cause, CauseKind, Latches, WallNs
 
@@ -15,7 +15,7 @@ from acsard.core.values import Cause, CauseKind, Latches, WallNs
 # number does not release it.
 MAX_CAUSES = 32
 
-OTHERS = "stopped_by_others"
+OTHERS: StopCode = "stopped_by_others"
 
 NAMELESS = "request"  # in a text, a client that has no name
 
