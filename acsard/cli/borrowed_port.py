@@ -46,11 +46,13 @@ class Loan:
             with open_connection(self._where) as robot:
                 # The port opens also if the call is refused: it names no cause of a robot that was
                 # off before, or whose wheels are outdated.
-                robot.call("activate", numbers=[] if self.outdated else list(numbers))
+                reply = robot.call("activate", numbers=[] if self.outdated else list(numbers))
         except AcsardError as error:
             self._tell(f"the daemon did not take the port back ({error}): `acsard call activate`")
         else:
-            self._tell(f"the daemon has the port again; {OUTDATED if self.outdated else NEUTRAL}")
+            off = f"the robot stays switched off: {reply.message}"
+            text = OUTDATED if self.outdated else NEUTRAL if reply.success else off
+            self._tell(f"the daemon has the port again; {text}")
 
     def begin(self, in_use: InUseError) -> None:
         """Ask the daemon to lend the port. Raises `InUseError` if it does not."""

@@ -43,7 +43,7 @@ class BoardInputs(Struct):
         return self.estop.missing(safety) or self.bumpers.missing(safety)
 
     def reopen(self) -> None:
-        """Record that the port was opened: another board may answer from now on."""
+        """Record that the port was opened or lent: another board may answer from now on."""
         self.estop.reopen()
         self.bumpers.reopen()
         self.battery.reopen()
@@ -68,8 +68,8 @@ class BoardInputs(Struct):
         statuses, safety, up = session.status.new, config.safety, session.link == "up"
         late = session.steps.is_late
         return [
-            *self.estop.process_reports(statuses, now_ns, safety, late=late),
-            *self.bumpers.process_reports(statuses, now_ns, safety, late=late),
+            *self.estop.process_reports(statuses, now_ns, safety, up=up, late=late),
+            *self.bumpers.process_reports(statuses, now_ns, safety, up=up, late=late),
             *self.battery.process_reports(statuses, now_ns, up, config.battery),
         ]
 

@@ -522,6 +522,7 @@ class Robot:
             state.life.deactivate(by, now)
             numbers = (state.life.latches.last,)
         state.life.port_released = True
+        state.inputs.reopen()
         state.checks.gyro.rest_s = 0.0
         return PORT_LENT, numbers
 

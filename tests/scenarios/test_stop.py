@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import msgspec
 import pytest
 
-from acsard.core.config.settings import Config, McuConfig
+from acsard.core.config.settings import Config, McuConfig, SafetyConfig
 from acsard.core.incoming.commands import Via
 from acsard.core.incoming.queries import Query
 from acsard.core.messages.cdr import Cdr
@@ -72,6 +72,35 @@ def test_the_port_is_released_at_rest_until_the_next_activate() -> None:
     assert world.call("activate").success
     world.run(1.0)
     assert (world.state.mode, world.port.released) == ("ready", False)
+
+
+@each("required", [False, True])
+def test_a_lent_port_is_silent_on_purpose_so_no_input_counts_as_pressed(required: bool) -> None:
+    safety = SafetyConfig(estop="required", bumpers=("front",)) if required else SafetyConfig()
+    world = World(Config(mcu=McuConfig(port="/dev/ttyACM0"), safety=safety))
+    with world.mcu.fault("estop"), world.mcu.fault("bumpers"):
+        world.run(1.5)
+        assert world.call("deactivate", RELEASE).success
+        world.run(5.0)
+        assert [cause.code for cause in world.state.causes] == ["switched_off"]
+        assert world.call("activate").success
+        world.run(2.0)
+        assert (world.state.mode, world.state.emergency_stop) == ("ready", "released")
+    # The board that came back reports its inputs no more.
+    world.run(0.6)
+    codes = {cause.code for cause in world.state.causes}
+    assert codes == {"emergency_stop_silent", "bumpers_silent"}
+
+
+def test_an_input_that_is_not_reported_after_a_loan_counts_as_pressed_once_the_link_is_up() -> None:
+    world = World(Config(mcu=McuConfig(port="/dev/ttyACM0")))
+    with world.mcu.fault("estop"):
+        world.run(1.5)
+        assert world.call("deactivate", RELEASE).success
+        world.run(5.0)
+    world.call("activate")
+    world.run(1.5)
+    assert [cause.code for cause in world.state.causes] == ["emergency_stop_silent"]
 
 
 @each("ask", ["stop", "deactivate"])

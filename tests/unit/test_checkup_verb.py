@@ -141,6 +141,11 @@ def test_a_robot_whose_file_the_check_changed_stays_switched_off(
     called(tmp_path, "--yes", "--wheels-are-lifted", *words, text="[mcu]\nport = '/dev/none'\n")
     robot.call.assert_called_with("activate", numbers=released)
     assert ("restart the daemon" in capsys.readouterr().err) is (not released)
+    if released:
+        refusal = schema.ServiceReply(success=False, message="a stop holds it")
+        robot.call.side_effect = [robot.call.return_value, refusal]
+        called(tmp_path, "--yes", "--wheels-are-lifted", text="[mcu]\nport = '/dev/none'\n")
+        assert "the robot stays switched off: a stop holds it" in capsys.readouterr().err
 
 
 def test_a_port_without_an_answer_is_not_written(

@@ -43,7 +43,7 @@ class Input:
     """
 
     def __init__(self, part: EmergencyStop | Bumpers, safety: SafetyConfig) -> None:
-        self.part, self.safety, self.now_ms = part, safety, 10_000
+        self.part, self.safety, self.now_ms, self.up = part, safety, 10_000, True
         self.events: list[tuple[str, str]] = []
 
     def step(self, *reports: str, ms: int = 10) -> str:
@@ -56,7 +56,7 @@ class Input:
                 line = BoardStatus(estop=marks == "!" if marks else None)
             lines.append((now_ns, line))
         late = ms * MS > LATE_NS
-        events = self.part.process_reports(lines, now_ns, self.safety, late=late)
+        events = self.part.process_reports(lines, now_ns, self.safety, up=self.up, late=late)
         self.events += [(event.name, event.code) for event in events]
         return self.part.state
 
