@@ -386,8 +386,9 @@ no_attachment
 bad_attachment
     a ROS message has a damaged attachment
 bad_echo
-    the echo in the attachment is not a beat
-    -> copy the newest message of the key beat into the field `echo`
+    the echo in the attachment is not a beat, or there is no sequence beside it
+    -> copy the newest message of the key beat into the field `echo`, and number the commands in
+    `sequence`
 """
 
 

@@ -194,7 +194,9 @@ class Json(Door):
         return self.stack.enter_context(Bus(self.robot.endpoint)).session
 
     def put(self, payload: bytes, echo: object = None, **more: Any) -> None:
-        signature = {"sender": self.sender} | ({"echo": echo} if echo else {})
+        signature = {"sender": self.sender} | (
+            {"echo": echo, "sequence": time.monotonic_ns()} if echo else {}
+        )
         self.session.put(self.key, payload, attachment=json.dumps(signature), **more)
 
     def send(self, linear: float, angular: float = 0.0) -> None:

@@ -225,7 +225,7 @@ BEAT = {"run": RUN, "boot_us": BEAT_US}
 
 @each("form", FORMS)
 def test_the_age_of_a_command_with_an_echo_is_its_arrival_minus_the_beat(form: Any) -> None:
-    attachment = form({"sender": "joystick/s3cret", "echo": BEAT})
+    attachment = form({"sender": "joystick/s3cret", "sequence": 12, "echo": BEAT})
     sample = ours(twist(), attachment=attachment, boot_ns=(BEAT_US + 7) * 1000)
     result = Receiver(Config().joint_names, KINEMATICS, RUN).command(sample)
     assert (result.echo, result.age_ns) == (Echo(RUN, BEAT_US * 1000), 7000)
@@ -248,6 +248,16 @@ def test_a_command_whose_echo_is_not_a_beat_is_refused(form: Any, echo: object) 
     assert caller_name("native", attachment) == "unnamed (native)"  # a stop still stops
     with pytest.raises(DecodeError, match="beside `sender`"):
         RECEIVER.command(ours(twist(), attachment=form({"echo": BEAT})))
+
+
+@each("form", FORMS)
+def test_an_echo_without_a_number_is_refused_because_a_beat_orders_no_two_commands(
+    form: Any,
+) -> None:
+    attachment = form({"sender": "joystick/s3cret", "echo": BEAT})
+    with pytest.raises(DecodeError, match="`sequence`") as raised:
+        RECEIVER.command(ours(twist(), attachment=attachment))
+    assert raised.value.reason == "bad_echo"
 
 
 # senders bound to certificates

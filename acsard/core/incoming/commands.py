@@ -165,6 +165,12 @@ class Receiver:
                 "the attachment has an echo that is not a beat: copy the newest message of the key "
                 "beat into its field `echo`, beside `sender`",
             )
+        if identity.echo is not None and identity.sequence is None:
+            raise DecodeError(
+                "bad_echo",
+                "the attachment has an echo, but no `sequence`: number the commands beside it, "
+                "because several of them may echo one beat",
+            )
         stamp_ns, clock = identity.stamp_ns, identity.sender
         if kind == "cmd":
             twist, header, cancelled = self._twist(arrival)
