@@ -169,9 +169,7 @@ class Robot:
             return QUIET
         events = [*heard.events, *state.announced]
         state.announced = ()
-        if before_ns is None:
-            arbiter.start(now_ns)
-        elif steps.is_late:
+        if before_ns is not None and steps.is_late:
             arbiter.resume(before_ns, now_ns, self.config.commands)
         if life.unshown:
             life.begin(now_ns)
@@ -189,8 +187,8 @@ class Robot:
             answers = self._serve(now, heard, events)
         if heard.speed_cap is not None:
             self._cap_speed(heard.speed_cap, events)
-        if life.mode not in UNLATCHED:
-            arbiter.watched_ns = max(arbiter.watched_ns, now_ns)
+        for announcement in heard.announced:
+            arbiter.announce(announcement)
         if heard.commands or heard.refusals:
             self._accept_commands(now_ns, heard, events)
         is_chosen = now_ns >= arbiter.until_ns

@@ -167,12 +167,27 @@ class Command(Struct, frozen=True, omit_defaults=True):
     # session, maybe of a router or a bridge, or only the key.
     shared: bool = False
     ros: bool = False  # some ROS tools never send a zero, which a text about one mentions
+    bridged: bool = False  # by a bridge of ROS, which numbers no commands
     stamp_replaced: bool = False  # by Zenoh, because the sender's clock is ahead of the daemon's
     echo: Echo | None = None
     # At `arrived_ns`, the time since the echoed beat; below 0 for a beat from the future. None
     # without an echo, and for one of another run.
     age_ns: Ns | None = None
 
+
+class Announcement(Struct, frozen=True):
+    """A liveliness token of a ROS publisher on the topic of a source has appeared or disappeared.
+
+    `sender` is the public name that its commands have, or `BRIDGES`: a bridge names no publisher.
+    """
+
+    source: str
+    sender: str
+    present: bool
+    at_ns: Ns
+
+
+BRIDGES = "bridge"
 
 Verb = Literal["stop", "clear", "activate", "deactivate", "reset_odometry", "set_pose", "set"]
 
@@ -438,12 +453,14 @@ class Heard(Struct, frozen=True, omit_defaults=True):
     events: tuple[Event, ...] = ()  # of other parts, to be logged with the robot's
     missed: int = 0  # control periods without a wake-up
     shutting_down: bool = False  # ramp to zero, and stay there
+    announced: tuple[Announcement, ...] = ()
 
     @property
     def asks_nothing(self) -> bool:
         """Whether there are at most bytes, gyro samples and events."""
         return not (
             self.commands
+            or self.announced
             or self.refusals
             or self.requests
             or self.speed_cap is not None

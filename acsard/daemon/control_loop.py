@@ -156,10 +156,11 @@ class ControlLoop:
             port.opened,
             port.trouble,
             received,
-            *taken,
+            *taken[:-1],
             events,
             missed,
             self.shutting_down,
+            taken.announced,
         )
 
     def _write(self, line: bytes, now: Instant) -> Written:

@@ -32,7 +32,7 @@ from acsard.core.incoming.queries import Query
 from acsard.core.messages.encodings import DecodeError
 from acsard.core.messages.keys_and_roles import IMU, SPEED_LIMIT
 from acsard.core.motion.kinematics import Kinematics
-from acsard.core.values import Command, Event, GyroSample, Refusal, Request, SpeedCap
+from acsard.core.values import Announcement, Command, Event, GyroSample, Refusal, Request, SpeedCap
 
 # Queries of a wake-up, beside one slow one (`set`, ROS parameters). More wait, so that a flood
 # costs no period.
@@ -55,6 +55,7 @@ class FromBus(NamedTuple):
     requests: tuple[Request, ...] = ()
     gyro: tuple[GyroSample, ...] = ()
     speed_cap: SpeedCap | None = None
+    announced: tuple[Announcement, ...] = ()
 
 
 NOTHING = FromBus()
@@ -119,7 +120,14 @@ class Intake:
             request = serve(query, refusals)
             if request is not None:
                 requests.append(request)
-        return FromBus(tuple(commands), tuple(refusals), tuple(requests), tuple(gyro), speed_cap)
+        return FromBus(
+            tuple(commands),
+            tuple(refusals),
+            tuple(requests),
+            tuple(gyro),
+            speed_cap,
+            batch.announced,
+        )
 
     def taken_stops(self) -> list[str]:
         """Return the clients whose stops the present wake-up has taken."""

@@ -74,7 +74,9 @@ def test_where_a_pause_arms_a_goal_under_way_does_not_drive_after_an_event(event
     if event == "restart":
         world = World()
         nav.world = world
-        world.run(4.5)  # until its Zenoh client tries again
+        for _ in range(240):  # until the network of the robot is up
+            nav.message(0.4)
+            world.run(0.05)
     else:
         nav.hold(0.4, 1.0)
     match event:
@@ -99,12 +101,14 @@ def test_where_a_pause_arms_a_goal_under_way_does_not_drive_after_an_event(event
             nav.hold(0.0, 0.2)
             world.run(12.0)
             world.stall(1.2)
+            nav.message(0.4)
     since_ns = world.now_ns + NS_PER_S // 2 * (event in ("clear", "deactivate"))
     nav.hold(0.4, 3.0)
     assert not moved(world, since_ns)
     assert world.state.code == "neutral", world.state.reason
+    nav.send(0.0)  # the goal is cancelled, and sent again
     world.run(1.1)
-    nav.hold(0.4, 0.5)  # the goal was cancelled and sent again
+    nav.hold(0.4, 0.5)
     assert world.state.mode == "driving"
 
 

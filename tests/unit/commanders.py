@@ -8,7 +8,15 @@ from acsard.core.config.settings import CommandsConfig, McuConfig, Source
 from acsard.core.link.link_setup import LinkSetup
 from acsard.core.link.step_times import StepTimes
 from acsard.core.motion.arbiter import Arbiter, Choice
-from acsard.core.values import NS_PER_S, REST, Command, SourceStatus, Twist
+from acsard.core.values import (
+    BRIDGES,
+    NS_PER_S,
+    REST,
+    Announcement,
+    Command,
+    SourceStatus,
+    Twist,
+)
 
 MS = 1_000_000
 GO = Twist(0.5, 0.2)
@@ -39,9 +47,7 @@ SETUP = LinkSetup.of(McuConfig(), 100.0)
 def begin(arbiter: Arbiter, steps: StepTimes, now_ns: int, commands: CommandsConfig) -> None:
     """Begin a step, as the robot does."""
     before_ns = steps.begin(SETUP, now_ns)
-    if before_ns is None:
-        arbiter.start(now_ns)
-    elif steps.is_late:
+    if before_ns is not None and steps.is_late:
         arbiter.resume(before_ns, now_ns, commands)
 
 
@@ -65,10 +71,12 @@ class Commanders:
     def act(self, who: str, what: str) -> str:
         """Send a command. Return "", or the code for which it is refused.
 
-        `source.sender`, with `*` if several programs may share the identity; `@50`: its stamp is
-        50 ms old.
+        `source.sender`, with `*` if several programs may share the identity, `^` for one behind a
+        bridge of ROS, and `#5` for the fifth command of a ROS publisher; `@50`: its stamp is 50 ms
+        old.
         """
-        source, _, sender = who.rstrip("*").partition(".")
+        who, _, number = who.partition("#")
+        source, _, sender = who.rstrip("*^").partition(".")
         what, stamped, late_ms = what.partition("@")
         if what == "unreadable":
             self.arbiter.notice(source, sender, self.now_ns)
@@ -77,7 +85,9 @@ class Commanders:
         return self.accept(
             Command(
                 source, TWISTS[what], self.now_ns, stamp_ns, sender, sender,
-                cancelled=what == "cancelled", shared=who.endswith("*"),
+                cancelled=what == "cancelled", shared=who.endswith(("*", "^")),
+                sequence=int(number) if number else None, bridged=who.endswith("^"),
+                ros=bool(number) or who.endswith("^"),
             )
         )  # fmt: skip
 
@@ -89,7 +99,8 @@ class Commanders:
         """Play a story, such as `high zero; 200 high nan ! not_finite > high; 51 ? low command`.
 
         A step may begin with a wait in ms. `!` is the refusal; `>` who drives; `?` what a source
-        waits for. `reset` requires a zero, `wake` is a step of the daemon.
+        waits for. `reset` requires a zero, `wake` is a step of the daemon. The token of a publisher
+        appears (`+pause.a`) or disappears (`-pause.a`); without a name it is that of a bridge.
         """
         for step in story.split(";"):
             did, _, wait = step.partition("?")
@@ -103,6 +114,10 @@ class Commanders:
                     self.arbiter.require_neutral(self.now_ns)
                 case ["wake"]:
                     begin(self.arbiter, self.steps, self.now_ns, self.commands)
+                case [token] if token[0] in "+-":
+                    source, _, sender = token[1:].partition(".")
+                    news = Announcement(source, sender or BRIDGES, token[0] == "+", self.now_ns)
+                    self.arbiter.announce(news)
                 case [who, what]:
                     assert self.act(who, what) == refused.strip(), step
             if driver:

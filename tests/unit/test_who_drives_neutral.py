@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from acsard.core.values import Command, Wait
+from acsard.core.values import Command
 from tests.each import each
 from tests.unit.commanders import GO, MS, TWISTS, Commanders
 
@@ -31,28 +31,82 @@ SHARED = {
     " ? high neutral",
 }
 PAUSE = {
-    "a pause of a second arms": "pause.a go > -; 1000 pause.a go > pause.a",
-    "not a shorter one": "pause.a go; 999 pause.a go > - ? pause neutral",
-    "a shared one too": "pause.a* go > -; 1000 pause.a* go > pause.a",
-    "a pause of all that share": "pause.a* go" + "; 600 pause.b* go > -; 600 pause.a* go > -" * 9,
-    "not at another source": "low.a go > -; 5000 low.a go > -",
+    "the first command of a publisher": "pause.a#1 go > pause.a",
+    "not its second, if the first was lost": "pause.a#2 go > - ? pause neutral",
+    "the successor of a zero": "pause.a#7 zero; 1000 reset; pause.a#8 go > pause.a",
+    "hours later, too": "pause.a#7 zero; 7200000 pause.a#8 go > pause.a",
+    "not sooner than a second": "pause.a#7 zero; reset; 999 pause.a#8 go > -",
+    "not if a number is missing": "pause.a#7 zero; 20000 pause.a#9 go > -",
+    "not the successor of a speed": "pause.a#7 go; 20000 pause.a#8 go > -",
+    "not for a number again": "pause.a#7 zero; pause.a#8 go; 20000 pause.a#8 go > -",
+    "not at another source": "low.a#1 go > -; 20000 low.a#2 go > -",
+    "a zero of ROS needs a second": "pause.a#7 zero; 999 pause.a#8 go > -",
+    "and no speed in it": "pause.a#7 zero; 500 pause.a#8 go; 600 pause.a#9 go > -",
+    "then it arms": "pause.a#7 zero; 500 pause.a#8 zero; 500 pause.a#9 go > pause.a",
+    "a zero of one with an id does not wait": "pause.a zero; pause.a go > pause.a",
+    "not on a plain key": "pause.a go > -; 100000 pause.a go > -; 100000 pause.a* go > -",
+    "a bridge that was there, and silent": "+pause; 11000 pause.a^ go > pause.a",
+    "not sooner than its lease": "+pause; 10999 pause.a^ go > -",
+    "not without its token": "11000 pause.a^ go > -; +pause; -pause; 20000 pause.a^ go > -",
+    "not while another one speaks": "+pause; 6000 pause.b^ go; 6000 pause.a^ go > -",
+    "not if a second bridge came": "+pause; 6000 +pause; 6000 pause.a^ go > -",
+    "nor if one of two went": "+pause; +pause; 6000 -pause; 10999 pause.a^ go > -",
+    "not if the daemon stood still": "wake; +pause; 10000 wake; 2000 pause.a^ go > -",
+    "between zero and proof": "+pause; pause.a^ zero; 11000 pause.a^ go > pause.a",
+    "a publisher of before": "+pause.a; 61000 pause.a#500 go > pause.a",
+    "not sooner than the lease of rmw": "+pause.a; 60999 pause.a#500 go > -",
+    "not by the token of another": "+pause.b; 61000 pause.a#500 go > -",
+    "not while its numbers tell more": "+pause.a; pause.a#5 go; 61000 pause.a#7 go > -",
 }
 
 
 @each(("name", "story"), [*SHARED.items(), *PAUSE.items()])
 def test_shared_identities_and_pauses(name: str, story: str) -> None:
-    one = Commanders()
-    one.arbiter.watched_ns = one.now_ns
-    one.play(story)
+    Commanders().play(story)
 
 
-def test_a_pause_counts_after_the_event_and_while_the_daemon_watches() -> None:
-    one = Commanders().play("5000 reset; 900 pause go > -")
-    assert one.choice().wait == Wait("neutral", "pause", 1.0, pause=True)
-    one.arbiter.watched_ns = one.wait(600).now_ns
-    one.play("600 pause go > -; 1000 pause go > pause")
-    # Not in the first five seconds of the daemon, in which lost clients come back.
-    one = Commanders().play("wake; 4000 pause go > -; 1999 pause go > -; 1000 pause go > pause")
+@each("pause_s", [1.0, 5.0, 9.9, 10.1, 10.9, 11.1, 15.0, 60.0, 3600.0])
+@each("who", ["pause.a#{}", "pause.a^"])
+def test_each_goal_after_the_first_drives_without_a_hand(pause_s: float, who: str) -> None:
+    """Nav2 sends a zero at the end of each goal, and then nothing."""
+    one, number = Commanders().play("+pause; +pause.a"), 100
+    one.play(f"50 {who.format(number)} zero")
+    for _ in range(4):
+        one.wait(1000 * pause_s)
+        for _ in range(40):
+            number += 1
+            one.play(f"50 {who.format(number)} go")
+        one.play("> pause.a")
+        number += 1
+        one.play(f"50 {who.format(number)} zero")
+
+
+@each("gap_s", [0.5, 1.1, 5.0, 10.5, 12.0, 61.5, 300.0])
+@each("who", ["pause.a#{}", "pause.a^", "pause.a", "pause.a*"])
+@each("event", ["reset", "first"])
+def test_a_publisher_that_never_stops_does_not_drive_after_a_gap(
+    gap_s: float, who: str, event: str
+) -> None:
+    """The network loses its commands, and its token after the lease; both come back together."""
+    one, number = Commanders(), 5000
+    if event == "reset":
+        one.play("+pause; +pause.a")
+        for _ in range(40):
+            number += 1
+            one.play(f"50 {who.format(number)} go")
+        one.play("reset")
+        if gap_s > 10:
+            one.play(f"{min(gap_s, 60.9) * 1000} -pause")
+        if gap_s > 61:
+            one.play(f"{(gap_s - 60.9) * 1000} -pause.a")
+        one.play("+pause; +pause.a")
+    if event == "first" or gap_s <= 10:
+        one.wait(1000 * gap_s)
+        one.play("+pause; +pause.a" if event == "first" else "")
+    number += round(20 * gap_s)
+    for _ in range(200):
+        number += 1
+        one.play(f"50 {who.format(number)} go > -")
 
 
 def test_the_second_begins_again_after_a_stall() -> None:
@@ -83,8 +137,10 @@ def test_a_shared_one_waits_for_its_second_and_a_pause_arms_with_the_proof() -> 
     for _ in range(40):
         one.wait(50).act("high.a*", "go@0")
     one.play("> -; 50 high.a* zero@0; 1000 high.a* go@0 > high.a")
-    one = Commanders().play("pause.a go@0 ! unproven > -" + "; 50 pause.a go@0 ! unproven > -" * 4)
-    one.play("50 pause.a go@0 > pause.a")
+    one = Commanders().play("pause.a#1 go@0 ! unproven > -")
+    for number in range(2, 6):
+        one.play(f"50 pause.a#{number} go@0 ! unproven > -")
+    one.play("50 pause.a#6 go@0 > pause.a")
 
 
 def test_what_a_network_held_back_does_not_arm() -> None:

@@ -13,7 +13,7 @@ from acsard.core.incoming.queries import Query, Reply
 from acsard.core.messages.encodings import DecodeError, StrictDecoder
 from acsard.core.messages.frames import FeedbackTopic
 from acsard.core.messages.schema import Beat, GatewayState, Message
-from acsard.core.values import Estimate, Event, Ns, RoutersStatus
+from acsard.core.values import Announcement, Estimate, Event, Ns, RoutersStatus
 
 
 class BusInput(Struct, frozen=True):
@@ -23,6 +23,7 @@ class BusInput(Struct, frozen=True):
     queries: tuple[Query, ...] = ()
     overrun: int = 0  # samples that the control loop did not fetch in time
     displaced: tuple[Arrival, ...] = ()  # the newest of them of each sender of commands
+    announced: tuple[Announcement, ...] = ()
 
 
 NO_INPUT = BusInput()

@@ -203,6 +203,7 @@ class Receiver:
             identity.sequence,
             shared=identity.shared,
             ros=arrival.via != "native",
+            bridged=arrival.via == "bridge",
             stamp_replaced=bool(ours and stamp_ns and stamp_ns - ours > MAX_TIMESTAMP_LEAD_NS),
             echo=echo,
             age_ns=None

@@ -17,8 +17,26 @@ from acsard.core.codes import AgeCode
 from acsard.core.config.settings import CommandsConfig, Source
 from acsard.core.link.step_times import CATCH_UP_NS
 from acsard.core.motion.ages import MARGIN_NS, SILENT_NS, Ages, Order
-from acsard.core.motion.neutral import FOREVER_NS, NEUTRAL_PAUSE_NS, Hint, Sender, is_zero
-from acsard.core.values import NS_PER_S, REST, Command, Ns, SourceStatus, Twist, Wait
+from acsard.core.motion.neutral import (
+    BRIDGE_LEASE_NS,
+    FOREVER_NS,
+    NEUTRAL_PAUSE_NS,
+    RMW_LEASE_NS,
+    Hint,
+    Sender,
+    is_zero,
+)
+from acsard.core.values import (
+    BRIDGES,
+    NS_PER_S,
+    REST,
+    Announcement,
+    Command,
+    Ns,
+    SourceStatus,
+    Twist,
+    Wait,
+)
 
 MAX_SENDERS = 16  # of a source; one that may drive is never replaced
 
@@ -28,9 +46,7 @@ NOTHING, COMMAND = Wait("nothing"), Wait("command")
 
 NOBODY = ("", "")
 
-# After a start no pause counts for this time: a Zenoh client that has lost the daemon tries again
-# every 4 s at most, and a goal that is under way at a restart must not look like a new one.
-RECONNECT_NS = 5 * NS_PER_S
+MAX_ANNOUNCED = 64  # ROS publishers of a source whose tokens are remembered
 
 
 class Choice(Struct, frozen=True):
@@ -51,7 +67,10 @@ class SourceSenders(Struct):
 
     senders: dict[str, Sender] = {}
     ages: Ages = field(default_factory=Ages)
-    forgot_ns: Ns = 0  # last message of a sender that was replaced
+    forgot_ns: Ns = 0  # last message of a bridged sender that was replaced
+    # Since when the token of a sender is there; of the bridges, since the last change.
+    announced: dict[str, Ns] = {}
+    bridges: int = 0  # their tokens
 
     def add(self, name: str, now_ns: Ns, timeout_ns: Ns) -> Sender | None:
         """Return a new sender (it may replace another one), or None."""
@@ -59,18 +78,45 @@ class SourceSenders(Struct):
             least = min(self.senders.values(), key=lambda other: other.worth(now_ns, timeout_ns))
             if least.worth(now_ns, timeout_ns)[0]:
                 return None
-            self.forgot_ns = max(self.forgot_ns, least.seen_ns)
+            if least.bridged:
+                self.forgot_ns = max(self.forgot_ns, least.seen_ns)
             self.senders = {
                 name: other for name, other in self.senders.items() if other is not least
             }
-        added = self.senders[name] = Sender(Order(), self.forgot_ns)
+        added = self.senders[name] = Sender(Order(), 0)
         return added
 
-    def quiet_ns(self, sender: Sender) -> Ns:
-        """Return the last message of a sender, or of all that share an identity."""
-        if not sender.shared:
-            return sender.seen_ns
-        return max(each.seen_ns for each in self.senders.values() if each.shared)
+    def announce(self, news: Announcement) -> None:
+        """Note that a token has appeared or disappeared."""
+        if news.sender == BRIDGES:
+            self.bridges = max(0, self.bridges + (1 if news.present else -1))
+        present = self.bridges > 0 if news.sender == BRIDGES else news.present
+        if not present:
+            self.announced.pop(news.sender, None)
+        elif news.sender in self.announced or len(self.announced) < MAX_ANNOUNCED:
+            self.announced[news.sender] = news.at_ns
+
+    def was_silent(self, sender: Sender, command: Command, since_ns: Ns) -> bool:
+        """Return whether the silence before a command is proved to be its sender's.
+
+        `since_ns`: the daemon stood still until then.
+        """
+        now_ns = command.arrived_ns
+        if now_ns - sender.seen_ns < NEUTRAL_PAUSE_NS:
+            return False
+        if sender.follows_rest(command):
+            return True
+        if command.bridged:
+            others = [each.seen_ns for each in self.senders.values() if each.bridged]
+            name, quiet_ns, lease_ns = BRIDGES, max([self.forgot_ns, *others]), BRIDGE_LEASE_NS
+        elif command.ros and not sender.number:
+            name, quiet_ns, lease_ns = command.sender, 0, RMW_LEASE_NS
+        else:
+            return False
+        announced_ns = self.announced.get(name)
+        return (
+            announced_ns is not None and now_ns - max(quiet_ns, announced_ns, since_ns) >= lease_ns
+        )
 
 
 class Arbiter(Struct):
@@ -81,8 +127,7 @@ class Arbiter(Struct):
     follows: bool = False  # the last choice has the twist of this sender
     since_ns: Ns = 0  # zeros from then on arm
     caught_up_ns: Ns = 0  # until then, commands may arrive that waited during the last stall
-    # From then on a pause counts: the robot could drive, and the daemon did not stand still.
-    watched_ns: Ns = 0
+    resumed_ns: Ns = 0  # end of the last time in which the daemon stood still
     until_ns: Ns = 0  # the last `choose` holds until then, unless another method is called
 
     def require_neutral(self, since_ns: Ns = 0) -> None:
@@ -92,7 +137,6 @@ class Arbiter(Struct):
         wants rest now. The latest `since_ns` counts.
         """
         self.since_ns = max(self.since_ns, since_ns)
-        self.watched_ns = max(self.watched_ns, since_ns)
         for source in self.sources.values():
             for sender in source.senders.values():
                 sender.require_neutral()
@@ -103,14 +147,14 @@ class Arbiter(Struct):
         for source in self.sources.values():
             source.ages = Ages()
 
-    def start(self, now_ns: Ns) -> None:
-        """Begin the first step."""
-        self.watched_ns = now_ns + RECONNECT_NS
+    def announce(self, news: Announcement) -> None:
+        """Note that the token of a ROS publisher has appeared or disappeared."""
+        self.sources.setdefault(news.source, SourceSenders()).announce(news)
 
     def resume(self, before_ns: Ns, now_ns: Ns, commands: CommandsConfig) -> None:
         """Begin a late step, before which the bus may not have delivered all commands."""
         self.until_ns, self.caught_up_ns = 0, now_ns + CATCH_UP_NS
-        self.watched_ns = max(self.watched_ns, now_ns)
+        self.resumed_ns = now_ns
         for settings in commands.sources:
             if (source := self.sources.get(settings.name)) is not None:
                 for sender in source.senders.values():
@@ -133,18 +177,22 @@ class Arbiter(Struct):
         sender = source.senders.get(command.sender) or source.add(command.sender, now_ns, timeout)
         if sender is None:
             return Wait("too_many_senders", command.source, MAX_SENDERS)
-        sender.shared, sender.ros = command.shared, command.ros
-        neutral = zero and now_ns >= self.since_ns
-        if not zero and settings.neutral_first == "pause":
-            quiet_ns = max(source.quiet_ns(sender), self.watched_ns)
-            neutral = now_ns - quiet_ns >= NEUTRAL_PAUSE_NS
-        sender.seen_ns = now_ns
+        neutral, pauses = zero and now_ns >= self.since_ns, settings.neutral_first == "pause"
+        # A filter of Nav2 sends zeros in mid-goal, such as collision_monitor without transforms.
+        waits = command.shared or (pauses and command.ros)
+        if pauses and not zero and not sender.is_armed(now_ns):
+            neutral = source.was_silent(sender, command, self.resumed_ns)
+        sender.receive(command)
+        if pauses and command.bridged and BRIDGES in source.announced:
+            sender.silent_ns = BRIDGE_LEASE_NS  # from then on its silence may be proved
         if now_ns - sender.refused_ns > SILENT_NS:
             sender.hint = None  # silence disarms also a sender whose zero was not proven yet
         if command.shared and not zero:
             for other in source.senders.values():
                 if other.shared:
                     other.cancel_zero(now_ns)
+        elif waits and not zero:
+            sender.cancel_zero(now_ns)
         stalled = not zero and now_ns < self.caught_up_ns
         verdict = source.ages.judge_age(command, sender.order, timeout, stalled)
         if verdict:
@@ -164,9 +212,9 @@ class Arbiter(Struct):
             self.until_ns = until_ns
         sender.take(command, timeout)
         if sender.hint is not None:
-            _accept_hint(sender, command, source.ages, timeout)
+            _accept_hint(sender, command, source.ages, timeout, waits=waits)
         if neutral:
-            sender.neutral(now_ns, zero)
+            sender.neutral(now_ns, zero, waits)
         return None
 
     def arrived_ns(self, choice: Choice) -> Ns | None:
@@ -300,14 +348,14 @@ def _keep_hint(sender: Sender, command: Command, timeout: Ns) -> None:
         sender.hint = Hint(is_zero(command), command.arrived_ns, delay, command.clock)
 
 
-def _accept_hint(sender: Sender, command: Command, ages: Ages, timeout: Ns) -> None:
+def _accept_hint(sender: Sender, command: Command, ages: Ages, timeout: Ns, *, waits: bool) -> None:
     # Now the clock is proven, so it is known whether the sender's zero was late.
     hint, clock = sender.hint, ages.clocks.get(command.clock)
     sender.hint = None
     if hint is None or hint.clock != command.clock or clock is None or clock.least is None:
         return
     if hint.delay - clock.least <= timeout:
-        sender.neutral(hint.at_ns, hint.zero)
+        sender.neutral(hint.at_ns, hint.zero, waits)
 
 
 def _refusal(

@@ -1,8 +1,14 @@
 """Applies the neutral-first rule to one sender: only an armed sender may drive the robot.
 
 A zero arms. If several programs may share the identity, the zero arms when no speed has followed
-for `NEUTRAL_PAUSE_NS`. Where the source says `neutral_first = "pause"`, this silence arms too, if
-the daemon watched it. `require_neutral` disarms, and so does silence of `SILENT_NS`.
+for `NEUTRAL_PAUSE_NS`. Where the source says `neutral_first = "pause"`, this holds for all of ROS,
+and silence arms too, but only silence that is proved to be the sender's and not the network's:
+
+- a sender that numbers its commands: its last message was a zero, and the next number follows.
+- any other ROS publisher: its liveliness token was there without a message for so long that a lost
+  network would have ended it. It says nothing sooner, because a token stays for its lease.
+
+`require_neutral` disarms, and so does silence of `silent_ns`.
 """
 
 from __future__ import annotations
@@ -13,9 +19,12 @@ from msgspec.structs import replace
 from acsard.core.motion.ages import SILENT_NS, Order
 from acsard.core.values import NS_PER_S, REST, Command, Ns, Twist, Wait
 
-# Longer than the pauses of irregular senders: without a speed behind a shared zero, or without any
-# message where a pause arms.
+# Longer than the pauses of irregular senders: without a speed behind a zero that waits, or without
+# any message where a pause arms.
 NEUTRAL_PAUSE_NS = NS_PER_S
+
+# The longest lease on the way, and a second: of a bridge, and of a session of rmw_zenoh.
+BRIDGE_LEASE_NS, RMW_LEASE_NS = 11 * NS_PER_S, 61 * NS_PER_S
 
 FOREVER_NS = 1 << 62
 
@@ -35,6 +44,10 @@ class Sender(Struct):
     order: Order
     seen_ns: Ns  # last message, even a refused one
     shared: bool = False  # several programs may share its identity
+    bridged: bool = False  # by a bridge of ROS
+    number: int = 0  # the highest one that was received
+    rests: bool = True  # the message with this number was a zero, or none has come
+    silent_ns: Ns = SILENT_NS  # without an accepted command, which disarm
     ros: bool = False  # the last command came from ROS, whose tools send no zero by themselves
     twist: Twist = REST
     arrived_ns: Ns | None = None  # last accepted command since `require_neutral`
@@ -43,7 +56,7 @@ class Sender(Struct):
     zeros_ns: Ns | None = None  # it has sent only zeros since then
     speeds_ns: Ns | None = None  # it has sent only speeds since then
     armed: bool = False
-    zero_ns: Ns | None = None  # zero of a shared identity, which arms after `NEUTRAL_PAUSE_NS`
+    zero_ns: Ns | None = None  # a zero that arms after `NEUTRAL_PAUSE_NS`
     hint: Hint | None = None
     refused: Wait | None = None  # why the last command was refused
     refused_ns: Ns = 0
@@ -59,7 +72,7 @@ class Sender(Struct):
         return self.arrived_ns is not None and now_ns - self.present_ns <= timeout_ns
 
     def is_armed(self, now_ns: Ns) -> bool:
-        if self.arrived_ns is None or now_ns - self.arrived_ns > SILENT_NS:
+        if self.arrived_ns is None or now_ns - self.arrived_ns > self.silent_ns:
             return False
         return self.armed or (
             self.zero_ns is not None and now_ns - self.zero_ns >= NEUTRAL_PAUSE_NS
@@ -78,7 +91,7 @@ class Sender(Struct):
             arrived_ns + timeout_ns + 1,
             self.present_ns + timeout_ns + 1,
             self.refused_ns + timeout_ns + 1,
-            arrived_ns + SILENT_NS + 1,
+            arrived_ns + self.silent_ns + 1,
             zero_ns + NEUTRAL_PAUSE_NS,
         ):
             if now_ns < time_ns < next_ns:
@@ -89,6 +102,21 @@ class Sender(Struct):
         """Forget the last command; the sender must be neutral again before it drives."""
         self.arrived_ns = self.zero_ns = self.hint = None
         self.armed = False
+
+    def receive(self, command: Command) -> None:
+        """Note a message, even one that is refused."""
+        self.seen_ns = command.arrived_ns
+        self.shared, self.ros, self.bridged = command.shared, command.ros, command.bridged
+        if command.sequence is not None and command.sequence > self.number:
+            self.number, self.rests = command.sequence, is_zero(command)
+
+    def follows_rest(self, command: Command) -> bool:
+        """Return whether the number of a command proves that nothing was sent since a zero.
+
+        A publisher of rmw_zenoh counts from 1, so nothing was sent before its first command.
+        """
+        known = self.number > 0 or command.ros
+        return known and not command.shared and self.rests and command.sequence == self.number + 1
 
     def cancel_zero(self, at_ns: Ns) -> None:
         """Cancel a zero, because another program of a shared identity may have sent a speed."""
@@ -124,9 +152,9 @@ class Sender(Struct):
         self.twist, self.arrived_ns, self.present_ns = command.twist, now_ns, now_ns
         self.refused = None
 
-    def neutral(self, at_ns: Ns, zero: bool) -> None:
-        """Arm after a zero, or after a pause that the daemon watched."""
-        if not (zero and self.shared):
+    def neutral(self, at_ns: Ns, zero: bool, waits: bool) -> None:
+        """Arm after a zero, which may wait for `NEUTRAL_PAUSE_NS`, or after a proved pause."""
+        if not (zero and waits):
             self.armed = True
         elif self.zero_ns is None:
             self.zero_ns = at_ns
