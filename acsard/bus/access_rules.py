@@ -24,7 +24,14 @@ from acsard.core.messages.keys_and_roles import (
     source_keys,
 )
 from acsard.core.messages.permissions import COMMAND_ROLE, Use, has, keys_for, least_role
-from acsard.core.ros.transports import PARAMETERS_PREFIX, Endpoint, claims, endpoints, unused_keys
+from acsard.core.ros.transports import (
+    PARAMETERS_PREFIX,
+    Endpoint,
+    announced_publishers,
+    claims,
+    endpoints,
+    unused_keys,
+)
 from acsard.core.values import ROLES, ROOT_KEY, Role
 
 # Messages that a daemon sends, except `put` (data), which has separate rules.
@@ -69,6 +76,7 @@ LOCAL_RULES = (
     *WIDE_SUBSCRIPTIONS["maintainer"],
     "command",
     "hand_on",
+    "announce",
     "look",
     "overhear",
     "err",
@@ -103,6 +111,7 @@ class _Keys:
         self.all = full_key(robot, "**")
         self.alive = full_key(robot, "alive")
         self.claims = claims(config.ros)
+        self.publishers = [tokens for tokens, _, _ in announced_publishers(config)]
         self.imu = full_key(robot, IMU)
         self.published = [full_key(robot, topic.key) for topic in outgoing]
         self.published += [full_key(robot, json_key(topic.key)) for topic in outgoing]
@@ -243,6 +252,8 @@ def _rules(keys: _Keys) -> list[Rule]:
         *rules,
         # A router has the role maintainer, and forwards the tokens of other daemons:
         _rule("appear", "ingress", ["liveliness_token"], [keys.alive, *keys.claims]),
+        # A ROS publisher of commands is there, which helps to arm it:
+        _rule("announce", "ingress", ["liveliness_token"], keys.publishers),
         # A client without a certificate commands, and a router forwards commands:
         _rule("command", "ingress", ["put"], keys.commands),
         _rule("hand_on", "ingress", ["put"], keys.commands_by("*")),

@@ -421,9 +421,9 @@ class Client(ABC):
     def driving(self, bus: Bus, name: str, type_name: str, speed: float) -> Iterator[None]:
         """Send a zero first, and then this speed at 20 Hz while the body runs."""
         self.publish_until_accepted(bus, name, type_name, lambda: PAYLOADS[type_name](0.0))
-        if not isinstance(self, RmwClient):
-            # All nodes behind a bridge are one sender: no speed may follow its zero for a second.
-            time.sleep(1.1)
+        # No speed may follow a zero of the source `nav` for a second, nor one of a bridge, behind
+        # which all nodes are one sender.
+        time.sleep(1.1)
         with repeated(lambda: self.put(name, type_name, PAYLOADS[type_name](speed))):
             yield
 
@@ -710,8 +710,8 @@ def drive(prefix, topic, type_name, speed, names, wanted):
         publishers[topic, type_name] = sdk.ROS2Publisher(
             topic, type_name, **definition(type_name), **router)
     publisher, begun, top = publishers[topic, type_name], time.monotonic(), 0.0
-    while top < wanted and time.monotonic() < begun + 5:
-        asked = speed if time.monotonic() > begun + 0.15 else 0.0
+    while top < wanted and time.monotonic() < begun + 7:
+        asked = speed if time.monotonic() > begun + 1.5 else 0.0
         publisher.publish(**fields(type_name, asked, names))
         time.sleep(0.02)
         message = last.get(prefix + "/odom")

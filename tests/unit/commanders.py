@@ -57,6 +57,7 @@ class Commanders:
     def __init__(self, armed: bool = False, reverse: bool = False) -> None:
         self.commands = CommandsConfig(SOURCES[::-1] if reverse else SOURCES)
         self.arbiter, self.steps = Arbiter(), StepTimes()
+        self.bridges = 0
         self.now_ns = 10 * NS_PER_S
         self.offset_ns = 1_800_000_000 * NS_PER_S
         if armed:
@@ -116,8 +117,13 @@ class Commanders:
                     begin(self.arbiter, self.steps, self.now_ns, self.commands)
                 case [token] if token[0] in "+-":
                     source, _, sender = token[1:].partition(".")
-                    news = Announcement(source, sender or BRIDGES, token[0] == "+", self.now_ns)
-                    self.arbiter.announce(news)
+                    present = token[0] == "+"
+                    if not sender:
+                        self.bridges += 1 if present else -1
+                        present = self.bridges > 0
+                    self.arbiter.announce(
+                        Announcement(source, sender or BRIDGES, present, self.now_ns)
+                    )
                 case [who, what]:
                     assert self.act(who, what) == refused.strip(), step
             if driver:

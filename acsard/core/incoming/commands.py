@@ -343,7 +343,9 @@ def identify(arrival: Arrival) -> Identity:
     if arrival.via == "rmw":
         rmw = unpack(arrival.attachment)
         # Only rmw makes GIDs unique; a bridge of one's own may send zeros for all its programs.
-        return Identity(_by_gid(rmw.gid), rmw.stamp_ns, rmw.sequence, shared=not any(rmw.gid))
+        return Identity(
+            publisher_name(rmw.gid), rmw.stamp_ns, rmw.sequence, shared=not any(rmw.gid)
+        )
     if arrival.via == "bridge":
         name = f"bridge/{public_name(arrival.sender)}" if arrival.sender else _by_key(arrival)
         return Identity(name, arrival.stamp_ns, shared=True)
@@ -364,8 +366,8 @@ def identify(arrival: Arrival) -> Identity:
     )
 
 
-def _by_gid(gid: bytes) -> str:
-    # No sender on acsard's own keys has such a public name.
+def publisher_name(gid: bytes) -> str:
+    """Return the public name of a publisher of rmw_zenoh, which no sender on native keys has."""
     return f"gid {public_name(gid.hex())}"
 
 
@@ -381,7 +383,7 @@ def claimed_identity(arrival: Arrival) -> Identity:
     if arrival.via == "rmw":
         gid = arrival.attachment[-GID_BYTES:]
         # A shorter GID could look like the public name of a native sender.
-        return Identity(_by_gid(gid) if len(gid) == GID_BYTES else "")
+        return Identity(publisher_name(gid) if len(gid) == GID_BYTES else "")
     return identify(arrival)
 
 

@@ -68,9 +68,8 @@ class SourceSenders(Struct):
     senders: dict[str, Sender] = {}
     ages: Ages = field(default_factory=Ages)
     forgot_ns: Ns = 0  # last message of a bridged sender that was replaced
-    # Since when the token of a sender is there; of the bridges, since the last change.
+    # Since when the token of a sender is there; of all bridges, since the last change.
     announced: dict[str, Ns] = {}
-    bridges: int = 0  # their tokens
 
     def add(self, name: str, now_ns: Ns, timeout_ns: Ns) -> Sender | None:
         """Return a new sender (it may replace another one), or None."""
@@ -88,10 +87,7 @@ class SourceSenders(Struct):
 
     def announce(self, news: Announcement) -> None:
         """Note that a token has appeared or disappeared."""
-        if news.sender == BRIDGES:
-            self.bridges = max(0, self.bridges + (1 if news.present else -1))
-        present = self.bridges > 0 if news.sender == BRIDGES else news.present
-        if not present:
+        if not news.present:
             self.announced.pop(news.sender, None)
         elif news.sender in self.announced or len(self.announced) < MAX_ANNOUNCED:
             self.announced[news.sender] = news.at_ns

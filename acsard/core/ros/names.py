@@ -142,6 +142,16 @@ def bridge_token(zid: str, kind: Kind, name: str, type_name: str, qos: Qos) -> s
     return f"{head}/:{how}:typehash={TYPE_HASHES[type_name]};"
 
 
+def bridged_publishers(name: str) -> str:
+    """Return the key expression of the tokens of all bridges with a publisher of a full name."""
+    return f"{bridge_presence('*')}/MP/{_in_one_chunk(bridge_key(name))}/**"
+
+
+def rmw_publishers(domain: int, name: str) -> str:
+    """Return the key expression of the tokens of all publishers of a full name."""
+    return f"@ros2_lv/{domain}/*/*/*/MP/*/*/*/{_mangled(name)}/**"
+
+
 def _mangled(name: str) -> str:
     return name.replace("/", "%")
 

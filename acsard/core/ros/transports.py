@@ -28,8 +28,10 @@ from acsard.core.ros.names import (
     bridge_key,
     bridge_presence,
     bridge_token,
+    bridged_publishers,
     full_name,
     rmw_key,
+    rmw_publishers,
 )
 from acsard.core.values import ROOT_KEY
 
@@ -176,6 +178,22 @@ def node_tokens(ros: RosConfig, zid: str) -> tuple[str, ...]:
 def command_keys(ros: RosConfig) -> tuple[str, ...]:
     """Return the Zenoh keys on which commands, speed limits and gyro samples arrive from ROS."""
     return tuple({e.key: None for e in endpoints(ros, "0") if e.direction == "in"})
+
+
+def announced_publishers(config: Config) -> tuple[tuple[str, str, Transport], ...]:
+    """Return the tokens of publishers for the sources where a pause arms, as key expressions.
+
+    The source and the transport are beside each.
+    """
+    ros, found = config.ros, list[tuple[str, str, Transport]]()
+    pausing = [source.name for source in config.commands.sources if source.neutral_first == "pause"]
+    for topic, source in SOURCES.items():
+        name = full_name(ros.namespace, topic)
+        if source in pausing and ros.bridge:
+            found.append((bridged_publishers(name), source, "bridge"))
+        if source in pausing and ros.rmw:
+            found.append((rmw_publishers(ros.domain, name), source, "rmw"))
+    return tuple(found)
 
 
 def claims(ros: RosConfig) -> tuple[str, ...]:

@@ -19,7 +19,14 @@ from acsard.core.incoming.imu import SIMULATOR_SENDER
 from acsard.core.messages.keys_and_roles import IMU, Topic, full_key, json_key, offered, published
 from acsard.core.messages.signature import Signature
 from acsard.core.ros.names import gid
-from acsard.core.ros.transports import Endpoint, claims, endpoints, node_tokens, unused_keys
+from acsard.core.ros.transports import (
+    Endpoint,
+    announced_publishers,
+    claims,
+    endpoints,
+    node_tokens,
+    unused_keys,
+)
 from acsard.core.values import NS_PER_S
 from acsard.daemon.bus.inbox import Inbox, Replies
 from acsard.daemon.bus.outlets import Outlets
@@ -96,6 +103,10 @@ class ZenohBus:
         zid = str(session.zid())
         for endpoint in endpoints(ros, zid, unused_keys(config)):
             self._declare_ros(session, endpoint)
+        for tokens, source, transport in announced_publishers(config):
+            on_token = direct(partial(self._inbox.on_token, source, transport))
+            subscriber = session.liveliness().declare_subscriber(tokens, on_token, history=True)
+            self._entities.append(subscriber)
         for token in (self._alive, *claims(ros), *node_tokens(ros, zid)):
             self._entities.append(session.liveliness().declare_token(token))
         self.output.start()

@@ -17,7 +17,7 @@ from itertools import count
 import zenoh
 
 from acsard.core.incoming.bus_interface import NO_INPUT, BusInput, Waker
-from acsard.core.incoming.commands import Arrival, Via, parts
+from acsard.core.incoming.commands import Arrival, Via, parts, publisher_name
 from acsard.core.incoming.queries import Query, Reply, most_bytes, refused
 from acsard.core.messages.keys_and_roles import (
     ANY_SERVICE,
@@ -30,8 +30,9 @@ from acsard.core.messages.keys_and_roles import (
     source_keys,
 )
 from acsard.core.messages.refusals import BUSY, BUSY_ENCODING, MAX_COMMAND_BYTES
-from acsard.core.ros.transports import Endpoint
-from acsard.core.values import NS_PER_S
+from acsard.core.ros.names import gid
+from acsard.core.ros.transports import Endpoint, Transport
+from acsard.core.values import BRIDGES, NS_PER_S, Announcement
 from acsard.host import clock
 from acsard.host.mailbox import Mailbox
 from acsard.host.threads import Worker
@@ -124,6 +125,8 @@ OTHER_SOURCES = ""
 
 ANY_CERTIFICATE = "*"  # for the name of any certificate in a command key
 
+MAX_TOKENS = 1024  # of publishers
+
 STOP_BUFFER = 16  # no flood of commands displaces a stop
 
 # Size of the queues of service calls, of slow queries (`set`, ROS parameters) and of others; more
@@ -176,6 +179,9 @@ class Inbox:
         self._lost = dict.fromkeys(self._arrivals, 0)  # displaced samples that `take` has reported
         # The newest displaced command of each sender since the last `take`.
         self._displaced: dict[tuple[str, Via, str, bool], Arrival] = {}
+        # The tokens of bridges by source, and the newest change of each sender since `take`.
+        self._bridges: dict[str, set[str]] = {}
+        self._announced: dict[tuple[str, str], Announcement] = {}
         self._any = False  # set after the item is in its buffer, so `take` overlooks none
         self._waker = waker
 
@@ -193,6 +199,7 @@ class Inbox:
                 overrun += box.lost - self._lost[key]
                 self._lost[key] = box.lost
         displaced, self._displaced = self._displaced, {}
+        announced, self._announced = self._announced, {}
         arrivals.sort(key=lambda arrival: arrival.arrived_ns)
         arrivals = self._stops.take() + arrivals
         due_queries = _taken_of(self._services, queries) + _taken_of(self._slow, 1)
@@ -200,7 +207,13 @@ class Inbox:
         if self._services or self._slow or self._others:
             # The other queries wait for the next step.
             self._any = True
-        return BusInput(tuple(arrivals), tuple(due_queries), overrun, tuple(displaced.values()))
+        return BusInput(
+            tuple(arrivals),
+            tuple(due_queries),
+            overrun,
+            tuple(displaced.values()),
+            tuple(announced.values()),
+        )
 
     # Zenoh's threads call the methods below.
 
@@ -217,6 +230,22 @@ class Inbox:
         key = str(sample.key_expr)
         native = endpoint.native if key == endpoint.key else key
         self._arrived(sample, native, endpoint.encoding, endpoint.transport)
+
+    def on_token(self, source: str, transport: Transport, sample: zenoh.Sample) -> None:
+        """Queue that the token of a ROS publisher for a source has appeared or disappeared."""
+        token, present = str(sample.key_expr), sample.kind == zenoh.SampleKind.PUT
+        sender = BRIDGES
+        if transport == "rmw":
+            sender = publisher_name(gid(token))
+        else:
+            # Several bridges are one sender, and a change of one of them is a change.
+            bridges = self._bridges.setdefault(source, set())
+            (bridges.add if present and len(bridges) < MAX_TOKENS else bridges.discard)(token)
+            present = bool(bridges)
+        if len(self._announced) < MAX_TOKENS or (source, sender) in self._announced:
+            at_ns = clock.now().mono_ns
+            self._announced[source, sender] = Announcement(source, sender, present, at_ns)
+            self._any = True
 
     def _arrived(self, sample: zenoh.Sample, key: str, encoding: str, via: Via) -> None:
         arrived, boot_ns = clock.now(), clock.boot_ns()
