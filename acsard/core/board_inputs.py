@@ -43,10 +43,15 @@ class BoardInputs(Struct):
         return self.estop.missing(safety) or self.bumpers.missing(safety)
 
     def reopen(self) -> None:
-        """Record that the port was opened or lent: another board may answer from now on."""
+        """Record that the port was opened: another board may answer from now on."""
         self.estop.reopen()
         self.bumpers.reopen()
         self.battery.reopen()
+
+    def lend(self) -> None:
+        """Record that the port is lent: the board is silent on purpose."""
+        self.estop.lend()
+        self.bumpers.lend()
 
     def expects_reports(self, session: McuSession) -> bool:
         """Return whether `process_reports` has something to do."""

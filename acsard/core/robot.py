@@ -351,6 +351,8 @@ class Robot:
         # A press stops the robot even if it began and ended between two wake-ups.
         inputs, life, config, now_ns = state.inputs, state.life, self.config, now.mono_ns
         estop, bumpers = inputs.estop, inputs.bumpers
+        if life.port_released:
+            inputs.lend()
         changes = inputs.process_reports(state.session, now_ns, config)
         if changes or state.session.status.new:
             state.arbiter.until_ns = 0  # bumpers limit the choice
@@ -520,7 +522,6 @@ class Robot:
             state.life.deactivate(by, now)
             numbers = (state.life.latches.last,)
         state.life.port_released = True
-        state.inputs.reopen()
         state.checks.gyro.rest_s = 0.0
         return PORT_LENT, numbers
 

@@ -55,6 +55,10 @@ class Sender:
         self.armed_ns = -1
         self.heard_ns = -1
         """Arrival of its last command."""
+        self.number = 0
+        """The highest number that arrived."""
+        self.rests = True
+        """The command with this number was a zero, or none has arrived."""
 
 
 class Clock:

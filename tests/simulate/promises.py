@@ -10,7 +10,6 @@ Times are true ns from the start. True time continues while the robot's clock st
 
 from __future__ import annotations
 
-import itertools
 from bisect import bisect_right
 from collections import Counter, deque
 from typing import Any, get_args
@@ -62,6 +61,9 @@ WAITED_NS = NS // 10 - MARGIN_NS
 
 PAUSE_NS = NS - MARGIN_NS
 """A silence of this length may arm a sender of a source whose senders pauses arm."""
+
+NUMBERED = ("client", "page", "signed", "rmw")
+"""Ways on which each command has a number; those of rmw begin with 1."""
 
 LOOK_NS = 2 * NS
 """A call without numbers is refused for this time, in which its sender may not know the cause."""
@@ -266,15 +268,20 @@ class Witness:
         if arrived_ns - known.heard_ns > SILENT_NS:
             known.armed_ns = -1
             known.zeros.clear()
-        if source in self.pausing:
-            calm_ns = max(known.heard_ns, self.armed_since_ns, self._stalled[1])
-            if arrived_ns - calm_ns > PAUSE_NS:
+        numbered = not sample.shared and sender["way"] in NUMBERED
+        if source in self.pausing and numbered and arrived_ns - known.heard_ns > PAUSE_NS:
+            # Nothing was sent since a zero, or ever.
+            begun = known.number > 0 or sender["way"] == "rmw"
+            if begun and known.rests and message.number == known.number + 1:
                 known.armed_ns = arrived_ns
+        if numbered and message.number > known.number:
+            known.number, known.rests = message.number, zero
+        waits = sample.shared or (source in self.pausing and sender["way"] == "rmw")
         known.heard_ns = arrived_ns
         late = sample.beat is not None and not self.ages.fresh(*arguments)
         if zero and late:
             pass  # it ends the speed of its sender, but arms nothing
-        elif zero and not sample.shared:
+        elif zero and not waits:
             known.armed_ns = arrived_ns
         elif zero:
             begun_ns, ended_ns = self._stalled
@@ -283,6 +290,9 @@ class Witness:
             del known.zeros[:-4000]
         elif sample.shared:
             self._cancel_zeros(source, arrived_ns, known)
+        elif waits:
+            self._arm(known, arrived_ns)
+            known.zeros.clear()
         wish.armed_ns = known.armed_ns
         self.wishes.append((source, wish))
         return wish
@@ -596,7 +606,7 @@ class Witness:
         """
         lasts_ns = ended_ns - begun_ns
         if lasts_ns > LATE_NS:
-            for known in itertools.chain.from_iterable(self._sharing.values()):
+            for known in self.senders.values():
                 self._arm(known, begun_ns)
                 known.zeros = [(ns + lasts_ns, arrived_ns) for ns, arrived_ns in known.zeros]
         before = self._stalled

@@ -1,11 +1,11 @@
 """Monitors the safety inputs that the board reports, and decides when one counts as pressed.
 
 An input that was reported once counts as pressed after `SILENCE_TIMEOUT_S` without a report: a
-cable may be cut, or the emergency stop may have cut the board's own supply. A port that is lent or
-that was just opened is silent on purpose: until the link is up, no silence counts. A pressed
-emergency stop latches a stop until `clear`. After the port was opened, another board may answer,
-and the input keeps its state until it is reported, or until `session.py` finds that it is not. The
-safety function is the hardware, which cuts the motors' power without the daemon.
+cable may be cut, or the emergency stop may have cut the board's own supply. A port that is lent is
+silent on purpose: no silence counts until the link is up again. A pressed emergency stop latches a
+stop until `clear`. After the port was opened, another board may answer, and the input keeps its
+state until it is reported, or until `session.py` finds that it is not. The safety function is the
+hardware, which cuts the motors' power without the daemon.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ class BoardInput(Struct):
     state: EstopState = ""  # "" if never reported
     pressed: tuple[bool, ...] | None = None  # None if never reported
     awaited: bool = True  # until the board on the newly opened port reports the inputs
-    opening: bool = True  # no link since the port was opened or lent
+    lent: bool = False  # the port is or was, and there was no link since then
     pressed_now: Reason | None = None  # by the last `process_reports`
     reported_ns: Ns = 0
     excused: bool = False  # a late step, since the last report
@@ -72,8 +72,12 @@ class BoardInput(Struct):
         return self.awaited and self.use(safety) == "required"
 
     def reopen(self) -> None:
-        """Record that the port was opened or lent; the state stays until a report or `forget`."""
-        self.awaited = self.opening = True
+        """Record that the port was opened; the state stays until a report or `forget`."""
+        self.awaited = True
+
+    def lend(self) -> None:
+        """Record that the port is lent to another program."""
+        self.lent = True
 
     def forget(self) -> None:
         """Forget the state if the board is certain not to report the inputs.
@@ -105,8 +109,8 @@ class BoardInput(Struct):
             if pressed is not None:
                 self.reported_ns, self.excused, self.awaited = at_ns, False, False
                 events += self._take("pressed" if any(pressed) else "ok", pressed, safety)
-        if self.opening:
-            self.reported_ns, self.opening = now_ns, not up
+        if self.lent:
+            self.reported_ns, self.lent = now_ns, not up
         if self.pressed is not None and now_ns - self.reported_ns > _SILENT_NS:
             # Excuse a late step once between two reports, or a loop that is always late would delay
             # the stop forever.
