@@ -3,11 +3,20 @@
 from __future__ import annotations
 
 from contextlib import AbstractContextManager, nullcontext
+from functools import partial
 
 import pytest
+from msgspec.structs import replace
 
-from acsard.core.config.settings import Config, ControlConfig, McuConfig, WheelMap
+from acsard.core.config.settings import (
+    MAX_REPLY_PERIOD_S,
+    Config,
+    ControlConfig,
+    McuConfig,
+    WheelMap,
+)
 from acsard.core.simulator.fake_mcu import FakeMcu
+from tests.each import each
 from tests.scenarios.world import World
 from tests.wheels import FOUR, TWO
 
@@ -93,6 +102,17 @@ def test_the_trailing_comma_option_reaches_the_last_wheel_of_a_comma_latched_mcu
         assert world.mcu.vehicle.set_points == [10.0, 10.0, 10.0, 10.0]
         world.run(2.0)
         assert world.mcu.vehicle.set_points == [0.0, 0.0, 0.0, 0.0]
+
+
+@each("period_s", [0.2, 0.24, MAX_REPLY_PERIOD_S])
+def test_a_board_whose_seldom_lines_look_like_zeros_of_the_host_gets_a_link(
+    period_s: float,
+) -> None:
+    world = World(Config(mcu=McuConfig(reply_period=period_s)))
+    padded = world.mcu.switched(partial(replace, unpadded_replies=False, ending="\r\n"))
+    with world.mcu.fault("free_running", period_s), padded:
+        world.run(4 * period_s + 0.3)
+        assert world.state.link == "up", world.state.reason
 
 
 @pytest.mark.parametrize("seconds", [2.0, pytest.param(600.0, marks=pytest.mark.slow)])

@@ -225,9 +225,13 @@ class McuSession(Struct):
         return (setup.mcu.encoder_counts if agree else 0,) * len(setup.codec.letters)
 
     def asks(self, at_ns: Ns) -> None:
-        """Wait for the answer to the question, and count no line before it."""
+        """Wait for the answer to the question; before the first one of a session no line counts.
+
+        A later one takes no line away: a board may send so few that it would never have enough.
+        """
+        if not self._echo.asked:
+            self._link.reset_good_lines()
         self._echo.asks(at_ns)
-        self._link.reset_good_lines()
 
     # sessions
 
