@@ -29,22 +29,6 @@ class _Approach(NamedTuple):
 _LINEAR = _Approach(0.3, 2.0, 0.02, 0.002)
 _ANGULAR = _Approach(1.0, 2.0, 0.05, 0.004)
 
-MAX_LEAP = 0.1, 0.2  # m and rad between two messages, beyond twice what their speeds explain
-
-
-def leaps(before: Odometry, odom: Odometry) -> bool:
-    """Return whether no motion explains the way between two messages: the pose was set."""
-    seconds = max(0.0, odom.time - before.time)
-    one, other = before.twist.twist, odom.twist.twist
-    linear = max(abs(one.linear.x), abs(other.linear.x))
-    angular = max(abs(one.angular.z), abs(other.angular.z))
-    here, there = before.pose.pose.position, odom.pose.pose.position
-    way, turn = math.hypot(there.x - here.x, there.y - here.y), odom.yaw - before.yaw
-    return (
-        way > MAX_LEAP[0] + 2.0 * linear * seconds
-        or abs(math.remainder(turn, math.tau)) > MAX_LEAP[1] + 2.0 * angular * seconds
-    )
-
 
 class Course(Protocol):
     left: float  # way to the end, m or rad

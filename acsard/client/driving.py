@@ -16,7 +16,7 @@ from typing import Protocol
 import zenoh
 
 from acsard.bus.subscription import encoded
-from acsard.client.course import Course, Straight, Turn, leaps
+from acsard.client.course import Course, Straight, Turn
 from acsard.client.follower import FIRST_STATE_TIMEOUT_S, Followed, Watch
 from acsard.client.ride import (
     GRACE_S,
@@ -46,6 +46,8 @@ COURSE_TIMEOUT_S = 3.0  # without coming nearer to the end of a course
 
 # What counts as nearer: this fraction of the rest, or on a long way this many m or rad.
 NEARER, MOST_NEARER = 0.01, 0.01
+
+POSES_SET = "poses_set"  # counter in `state`
 
 POSE_SET = "the pose was set during the drive, when {} was left: drive the rest of the way anew"
 
@@ -98,6 +100,12 @@ class Driver:
         now = clock.steady_s()
         for state in self.watch.poll(now):
             self.ride.state(state, now)
+
+    @property
+    def poses_set(self) -> int:
+        """How often the pose was set since the start of the daemon, by the newest state."""
+        state = self.watch.state
+        return 0 if state is None else state.counters.get(POSES_SET, 0)
 
     def require(self) -> None:
         """Raise an error if the ride has ended, or if the daemon is silent.
@@ -195,15 +203,23 @@ def _course(begin: Callable[[Odometry], Course]) -> Steps:
     # The steps raise the errors of `drive`.
     def steps(driver: Driver) -> Generator[Seconds, None, None]:
         with closing(_Odometer(driver)) as odometer:
-            while (odom := odometer.newest()) is None:
+            # The odometry behind a new state has all poses that this state counts.
+            began, odom, sets = clock.steady_s(), None, None
+            while odom is None:
                 yield COURSE_PERIOD_S
                 driver.take()
+                odom = odometer.newest()
+                if sets is None:
+                    odom = None
+                    sets = driver.poses_set if driver.watch.last_seen > began else None
             course, nearest, nearer = begin(odom), math.inf, odometer.received
             while not course.is_done:
                 now = clock.steady_s()
                 fresh = now - odometer.received < MAX_ODOM_AGE_S
                 driver.step(course.twist if fresh else None)
                 driver.require()
+                if driver.poses_set != sets:
+                    raise NotDrivenError(POSE_SET.format(course.left_text))
                 left = abs(course.left)
                 if driver.ride.begun is None or left < nearest - min(NEARER * nearest, MOST_NEARER):
                     nearest, nearer = left, now
@@ -214,11 +230,10 @@ def _course(begin: Callable[[Odometry], Course]) -> Steps:
                     )
                 yield min(COURSE_PERIOD_S, driver.ride.period)
                 if (newest := odometer.newest()) is not None:
-                    if leaps(odom, newest):
-                        raise NotDrivenError(POSE_SET.format(course.left_text))
-                    odom = newest
-                    course.odom(odom)
+                    course.odom(newest)
         yield from driver.stop()
+        if driver.poses_set != sets:
+            raise NotDrivenError(POSE_SET.format("an unknown way"))
 
     return steps
 

@@ -540,6 +540,7 @@ class Robot:
     def place(self, pose: Pose) -> str:
         state = self.state
         state.odometry.set_pose(pose, self.model)
+        state.count("poses_set")
         state.checks.gyro.forget_doubt()
         pose = state.odometry.pose
         return f"pose is x {pose.x:g}, y {pose.y:g}, yaw {pose.yaw:g}"

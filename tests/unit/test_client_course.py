@@ -150,8 +150,10 @@ class Rolling(WithOdometry):
         super().send(linear, angular)
         self.linear, self.angular = linear, angular
 
-    def follow(self, steps: Steps, is_set: float = math.inf) -> None:
-        """Drive a course, for at most 1000 s. After `is_set` s, the odometry is reset."""
+    def follow(
+        self, steps: Steps, is_set: float = math.inf, by: tuple[float, float, float] = (3.0, 2.0, 2)
+    ) -> None:
+        """Drive a course, for at most 1000 s. After `is_set` s, the pose is set."""
         robot: Any = self
         body = self.body
         for pause in steps(Driver(robot)):
@@ -163,7 +165,9 @@ class Rolling(WithOdometry):
             body.y += self.linear * math.sin(body.yaw) * pause
             body.yaw += self.angular * pause
             if self.passed >= is_set:
-                body.x, body.y, body.yaw, is_set = 0.0, 0.0, 0.0, math.inf
+                x, y, yaw = by
+                body.x, body.y, body.yaw, is_set = body.x + x, body.y + y, body.yaw + yaw, math.inf
+                self.counters["poses_set"] = self.counters.get("poses_set", 0) + 1
 
 
 def test_a_long_way_at_a_low_speed_is_driven_to_its_end() -> None:
@@ -175,14 +179,26 @@ def test_a_long_way_at_a_low_speed_is_driven_to_its_end() -> None:
     assert world.turned == pytest.approx(4 * math.pi, abs=0.02)
 
 
-def test_a_course_ends_if_the_pose_is_set_on_the_way() -> None:
-    # From (3, -2) to (0, 0): the robot would drive 4.5 m in place of 1 m.
+@each("by", [(3.0, -2.0, 2.0), (0.09, 0.0, 0.0), (0.0, 0.0, 0.18), (0.0, 0.0, -0.1), (0.0,) * 3])
+def test_a_course_ends_if_the_pose_is_set_on_the_way(by: tuple[float, float, float]) -> None:
     world = Rolling()
     with pytest.raises(NotDrivenError, match="the pose was set"):
-        world.follow(move(1.0, 0.3), is_set=2.0)
+        world.follow(move(1.0, 0.3), is_set=2.0, by=by)
     assert world.way < 0.7
     world = Rolling()
-    world.body.x, world.body.y, world.body.yaw = 0.0, 0.0, 2.0
     with pytest.raises(NotDrivenError, match="the pose was set"):
-        world.follow(turn(90.0, 0.8), is_set=1.0)
+        world.follow(turn(90.0, 0.8), is_set=1.0, by=by)
     assert world.turned < 1.0
+
+
+def test_a_pose_that_was_set_before_a_course_or_in_its_last_moments_counts_likewise() -> None:
+    world = Rolling()
+    world.counters = {"poses_set": 5}
+    world.follow(move(0.1, 0.3), is_set=0.0, by=(1.0, 1.0, 1.0))
+    assert world.way == pytest.approx(0.1, abs=0.01)
+    world = Rolling()
+    world.follow(move(0.1, 0.3))
+    ended = world.passed
+    world = Rolling()
+    with pytest.raises(NotDrivenError, match="the pose was set"):
+        world.follow(move(0.1, 0.3), is_set=ended - 0.25, by=(0.0, 0.0, 0.0))

@@ -65,6 +65,7 @@ class World:
         World.newest = self
         self.now = 100.0
         self.sent: list[float] = []
+        self.counters: dict[str, int] = {}
         self.asked = 0
         self.subscribed = self.answers = True
         self.published = True
@@ -107,7 +108,8 @@ class World:
         state = self._says(self.passed, self.sent[-1] if self.sent else 0.0, self.sent)
         if state is None:
             return None
-        return sample_of(replace(state, stamp=Time.from_ns(int(self.now * NS_PER_S))))
+        stamp, counters = Time.from_ns(int(self.now * NS_PER_S)), self.counters or state.counters
+        return sample_of(replace(state, stamp=stamp, counters=counters))
 
     @property
     def passed(self) -> float:
