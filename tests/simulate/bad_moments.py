@@ -553,6 +553,45 @@ def _driven(
     return alone
 
 
+def _late_network(plan: Plan, dice: random.Random) -> None:
+    """Let the network lose the commands around events that disarm, where a pause arms.
+
+    Each goal ends with a zero and then silence, but some last over an event.
+    """
+    driver = _alone(plan, dice, [])
+    for source in plan["config"]["commands"]["sources"]:
+        source["neutral_first"] = "pause"
+    driver["way"] = dice.choice(("rmw", "rmw", "rmw", "signed", "client", "bridge", "plain"))
+    phases: list[list[Any]] = [[0.0, 0.0, 0.0], [1.4, None, None]]
+    away: list[list[float]] = []
+    at = 3.0
+    while at < plan["seconds"] - 12.0:
+        phases.append([round(at, 3), *_speed(dice)])
+        at += dice.uniform(2.0, 4.0)
+        if dice.random() < 0.6:
+            begin = at + dice.uniform(-1.0, 1.0)
+            away.append([round(begin, 3), round(begin + dice.uniform(0.5, 6.0), 3)])
+            plan["events"] += _disarming(dice, at)
+            at += dice.uniform(6.0, 8.0)
+        phases.append([round(at, 3), 0.0, 0.0])
+        at += dice.choice((0.1, 0.5, 1.2))
+        phases.append([round(at, 3), None, None])
+        at += dice.choice((0.3, 1.2, 3.0, 11.0))
+    driver |= {"phases": phases, "away": away}
+
+
+def _disarming(dice: random.Random, at: float) -> list[Event]:
+    match dice.randrange(4):
+        case 0:
+            return [_call(at - 2.5, "stop"), _call(at, "clear", named=True)]
+        case 1:
+            return [_call(at - 2.5, "deactivate"), _call(at, "activate", named=True)]
+        case 2:
+            return [{"at": round(at, 3), "do": "restart", "way": "kill", "for": 0.3}]
+        case _:
+            return [{"at": round(at, 3), "do": "reset", "deaf": 0.05}]
+
+
 MOMENTS: dict[str, tuple[float, Callable[[Plan], bool], Callable[[Plan, random.Random], None]]] = {
     "late step": (0.05, _any, _late_step),
     "half duplex": (0.12, _is_plain, _half_duplex),
@@ -578,6 +617,7 @@ MOMENTS: dict[str, tuple[float, Callable[[Plan], bool], Callable[[Plan, random.R
     "set points": (0.05, _is_plain, _driven(moments_of_wheels.set_points)),
     "stuck encoder": (0.03, _is_plain, _driven(moments_of_wheels.stuck_encoder)),
     "replies twice": (0.03, _is_plain, _driven(moments_of_wheels.replies_twice)),
+    "late network": (0.05, _any, _late_network),
 }
 """The share of the plans that have each moment, of those that can have it, whether a plan can have
 it, and what makes it."""

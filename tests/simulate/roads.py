@@ -93,7 +93,7 @@ def messages(sender: dict[str, Any], seed: int, seconds: float, wall_ns: int) ->
                 sender["delay"] + _jitter(sender["jitter"], chance[0]) + congestion_delay(sender, t)
             )
             arrives_ns = int((t + late) * NS)
-            lost = chance[1] < sender["loss"]
+            lost = chance[1] < sender["loss"] or _is_away(sender, t)
             junk = kinds[int(chance[2] * 1e6) % len(kinds)] if chance[3] < sender["junk"] else ""
             if not lost:
                 arrives_ns = last_ns = max(last_ns + 1000, arrives_ns)
@@ -159,6 +159,12 @@ def congestion_delay(sender: dict[str, Any], t: float) -> float:
             case "burst":
                 return float(size - (t - begin) % size)
     return 0.0
+
+
+def _is_away(sender: dict[str, Any], t: float) -> bool:
+    """Return whether the network loses all that is sent at `t`."""
+    away: list[list[float]] = sender.get("away", [])
+    return any(begin <= t < end for begin, end in away)
 
 
 def _ahead(sender: dict[str, Any], t: float) -> float:
