@@ -7,6 +7,7 @@ from msgspec import Struct
 from acsard.core.codes import Code
 from acsard.core.robot import Robot
 from acsard.core.values import (
+    Announcement,
     Answer,
     Command,
     Estimate,
@@ -55,6 +56,7 @@ class Inputs(Struct, frozen=True):
     # Time from the previous step to the write of its line, from 1 ms on: the process has stalled.
     late_ns: Ns = 0
     speed_cap: SpeedCap | None = None  # newest one since the previous step
+    announced: tuple[Announcement, ...] = ()
 
 
 class Outputs(Struct, frozen=True):
@@ -128,5 +130,5 @@ def heard_of(inputs: Inputs) -> Heard:
     return Heard(
         inputs.port_open, inputs.opened, inputs.port_trouble, inputs.received, inputs.commands,
         inputs.refusals, inputs.requests, inputs.gyro, inputs.speed_cap, inputs.events,
-        inputs.missed, inputs.shutting_down,
+        inputs.missed, inputs.shutting_down, inputs.announced,
     )  # fmt: skip

@@ -7,7 +7,15 @@ from msgspec.structs import replace
 
 from acsard.core.config.settings import Config, McuConfig, OdometryConfig
 from acsard.core.motion.uncertainty import UNKNOWN_POSE
-from acsard.core.values import REST, Request, Verb, WheelSpeeds
+from acsard.core.values import (
+    BRIDGES,
+    REST,
+    Announcement,
+    Command,
+    Request,
+    Verb,
+    WheelSpeeds,
+)
 from tests.each import each
 from tests.unit.rig import GO, ZERO_LINE, Rig
 
@@ -75,6 +83,33 @@ def test_the_pose_is_unknown_after_another_program_had_the_port_until_it_is_set(
     rig.asked(Request("reset_odometry", 4))
     rig.run(5)
     assert rig.out.estimates[-1].covariance.xx < 1e-4
+
+
+def test_while_another_program_has_the_port_no_silence_of_an_input_counts() -> None:
+    rig = Rig(REAL).board(b"!status estop=ok bumpers=..\r\n").linked()
+    rig.run(5)
+    (answer,) = rig.asked(Request("deactivate", 1, release_port=True)).answers
+    rig.board(b"").unplug().run(200)
+    assert rig.mode == "inactive"
+    rig.replug().asked(Request("activate", 2, numbers=answer.numbers))
+    rig.linked().run(40)
+    assert rig.mode == "ready"
+    rig.run(20)  # the board does not report them any more
+    assert rig.mode == "stopped"
+
+
+def test_the_token_of_a_bridge_and_its_silence_arm_it_where_a_pause_does() -> None:
+    rig = Rig(REAL).linked()
+    token = Announcement("nav", BRIDGES, present=True, at_ns=rig.now_ns)
+    rig.step(announced=(token,))
+    for wait_ms, mode in ((10_900, "ready"), (11_000, "driving")):
+        for _ in range(wait_ms // 10):
+            rig.step()
+        command = Command(
+            "nav", GO, rig.now_ns, sender="bridge/nav", shared=True, ros=True, bridged=True
+        )
+        rig.step(commands=(command,))
+        assert rig.mode == mode
 
 
 def test_the_gyro_of_a_robot_that_another_program_may_turn_does_not_rest() -> None:

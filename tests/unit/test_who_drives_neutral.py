@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pytest
 
+from acsard.core.motion.arbiter import MAX_ANNOUNCED, MAX_SENDERS
 from acsard.core.values import Command
 from tests.each import each
 from tests.unit.commanders import GO, MS, TWISTS, Commanders
@@ -63,6 +64,21 @@ PAUSE = {
 @each(("name", "story"), [*SHARED.items(), *PAUSE.items()])
 def test_shared_identities_and_pauses(name: str, story: str) -> None:
     Commanders().play(story)
+
+
+def test_a_bridged_sender_that_was_replaced_has_spoken_all_the_same() -> None:
+    one = Commanders().play("+pause; 6000 pause.first^ go")
+    for number in range(MAX_SENDERS):
+        one.play(f"pause.{number} go")
+    one.play("6000 pause.a^ go > -; 11000 pause.a^ go > pause.a")
+
+
+def test_no_number_of_tokens_takes_memory_for_ever() -> None:
+    one = Commanders()
+    for number in range(2 * MAX_ANNOUNCED):
+        one.play(f"+pause.{number}")
+    assert len(one.arbiter.sources["pause"].announced) == MAX_ANNOUNCED
+    one.play("-pause.0; +pause.1; 61000 pause.1#500 go > pause.1; pause.90#500 go > pause.1")
 
 
 @each("pause_s", [1.0, 5.0, 9.9, 10.1, 10.9, 11.1, 15.0, 60.0, 3600.0])

@@ -67,7 +67,7 @@ class SourceSenders(Struct):
 
     senders: dict[str, Sender] = {}
     ages: Ages = field(default_factory=Ages)
-    forgot_ns: Ns = 0  # last message of a bridged sender that was replaced
+    forgot_ns: Ns = 0  # last message of a sender that was replaced
     # Since when the token of a sender is there; of all bridges, since the last change.
     announced: dict[str, Ns] = {}
 
@@ -77,8 +77,7 @@ class SourceSenders(Struct):
             least = min(self.senders.values(), key=lambda other: other.worth(now_ns, timeout_ns))
             if least.worth(now_ns, timeout_ns)[0]:
                 return None
-            if least.bridged:
-                self.forgot_ns = max(self.forgot_ns, least.seen_ns)
+            self.forgot_ns = max(self.forgot_ns, least.seen_ns)
             self.senders = {
                 name: other for name, other in self.senders.items() if other is not least
             }
