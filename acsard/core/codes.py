@@ -60,7 +60,7 @@ GUARD_CODES: tuple[GuardCode, ...] = get_args(GuardCode)
 # Causes of a latched fault.
 FaultCode = Literal[
     GuardCode, "driver_fault", "impossible_speeds", "wheel_reversed", "wheel_runaway",
-    "wheel_too_fast", "wheels_swapped",
+    "wheel_too_fast", "wheels_swapped", "no_wheel_moves",
 ]  # fmt: skip
 
 # Trouble of a wheel that does not stop the robot.
@@ -217,6 +217,10 @@ wheel_too_fast
 wheels_swapped
     {wheels} wheels do not obey their commands: each turns as the other one is commanded {figures}:
     -> check whether their motors or encoders are swapped, or reversed
+no_wheel_moves
+    all wheels turned, and for {seconds:g} s none has shown any motion {figures}:
+    -> is the robot blocked, have the encoders or the motors lost their supply, or does the board
+    report no speeds any more?
 wheel_blocked
     {wheel} wheel is blocked, or has no power:
     -> check cable, motor and encoder, and for the last motor of a line also the setting

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from contextlib import AbstractContextManager, ExitStack
+from functools import partial
 from itertools import product
 
 import pytest
+from msgspec.structs import replace
 
 from acsard.core.config.contradictions import MOST_ASKED_HZ
 from acsard.core.config.settings import (
@@ -263,3 +266,32 @@ def test_two_swapped_motors_are_one_cause_whichever_wheel_shows_it(wheels: Wheel
     with world.mcu.fault("swapped_motors", 0, 1):
         world.drive(0.0, 1.5, seconds=4.0)
     assert [cause.code for cause in world.state.causes].count("wheels_swapped") == 1
+
+
+@four_and_two
+@pytest.mark.parametrize("counts", [48, 400, 3200])
+def test_encoders_that_die_all_at_once_stop_the_robot_within_a_second_by_one_fault(
+    wheels: WheelMap, counts: int
+) -> None:
+    config = Config(mcu=McuConfig(wheels=wheels), sim=SimConfig(encoder_counts=counts))
+    world = World(config)
+    world.drive(0.5, 0.3, seconds=3.0)
+    way = world.mcu.vehicle.pose
+    dead = partial(replace, gains=(0.0,) * len(wheels.letters))
+    with world.mcu.switched(dead):
+        world.hold(0.5, 0.3, seconds=3.0)
+        assert world.state.mode == "fault"
+        assert [cause.code for cause in world.state.causes] == ["no_wheel_moves"]
+        assert "wheel_blocked" not in {event.code for event in world.events}
+        there = world.mcu.vehicle.pose
+        assert math.hypot(there.x - way.x, there.y - way.y) < 0.5 * (1.0 + 0.2) + 0.3
+
+
+@four_and_two
+def test_motors_that_lose_their_power_slow_down_and_latch_nothing(wheels: WheelMap) -> None:
+    world = World(Config(mcu=McuConfig(wheels=wheels)))
+    world.drive(0.5, seconds=2.0)
+    with world.mcu.switched(partial(replace, drives=(0.0,) * len(wheels.letters))):
+        world.hold(0.5, seconds=3.0)
+    assert world.state.mode == "driving"
+    assert "is blocked, or has no power" in world.state.wheel_fault

@@ -364,7 +364,8 @@ FAULTS = (
     fault("wheel fast", "a robot that is faster than its limiter is never a fault", WHEELS_LAW,
           "if wheel.fast_s >= TOO_FAST_S and", "if False and"),
     fault("wheel blocked", "a wheel that does not turn is not reported", WHEELS_LAW,
-          "elif off * command < 0.0 and abs(speed) < AGREEMENT * abs(command):", "elif False:"),
+          "elif off * command < 0.0 and abs(speed) < AGREEMENT * abs(command) and not self.none_s:",
+          "elif False:"),
     fault("wheel reversed", "a wheel that turns the wrong way is never a fault", WHEELS_LAW,
           "elif goes_on and abs(speed) >= AGREEMENT * abs(command):", "elif False:"),
     # bus

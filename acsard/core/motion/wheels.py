@@ -74,6 +74,10 @@ COMMANDED = 0.005  # rad/s: a line to the board shows a lower one as 0.00
 
 REPEATED_S = 1.0  # between two reports of motion without a command
 
+# No wheel moves: all of them turned this fast under such a command, and at once none shows any
+# motion. Motors without power slow down.
+NONE_SPEED, AT_ONCE_S, NONE_S = 2.0, 0.1, 1.0
+
 SWAPPED_FRACTION = 0.2  # of the commands: by how much those of the sides must differ
 
 # Encoder counts per turn if they are not configured: the least that acsard supports.
@@ -125,6 +129,9 @@ class Wheels(Struct):
     lines: int = 0
     max_difference: Rad = 0.0  # of front and rear in one block, beyond which it ends early
     unreported_s: Seconds = REPEATED_S
+    all_turned: bool = False  # at `NONE_SPEED` at least, until `AT_ONCE_S` before the last motion
+    slow_s: Seconds = 0.0  # with any motion since then
+    none_s: Seconds = 0.0  # without any
     excludes: bool = False
     slips: bool = False  # the wheels of a side contradict each other
     missed: tuple[tuple[SideName, Wheels4], ...] = ()  # by both wheels of a side
@@ -231,6 +238,7 @@ class Wheels(Struct):
         for wheel in self.wheels:
             wheel.off = wheel.fast_s = wheel.fast_angle = wheel.missed = 0.0
             wheel.away_s = wheel.away_angle = 0.0
+        self.all_turned, self.none_s = False, 0.0
         for side in self.sides:
             side.peak = side.next_peak = 0.0
 
@@ -289,12 +297,30 @@ class Wheels(Struct):
                     self._disobeys(i, wheel, angle, block.unit)
             if wheel.warning and wheel.agrees and not still and wheel.pace_s == 0.0:
                 self._warn(i, wheel, None)
+        self._find_none(block)
         self.unreported_s += s
         if fastest and self.unreported_s >= REPEATED_S:
             self.unreported_s = 0.0
             self.pushed = (
                 f"wheels turn at {fastest:.1f} rad/s without a command: is the robot being pushed?"
             )
+
+    def _find_none(self, block: Block) -> None:
+        turned, least, before = list(map(abs, block.angles)), NONE_SPEED * block.s, self.none_s
+        commands = [side.command for side in self.sides]
+        if min(turned) >= least:
+            self.all_turned, self.slow_s, self.none_s = True, 0.0, 0.0
+        elif any(turned):
+            self.slow_s, self.none_s = self.slow_s + block.s, 0.0
+            self.all_turned = self.all_turned and self.slow_s <= AT_ONCE_S
+        elif not self.all_turned or min(map(abs, commands)) < NONE_SPEED:
+            self.all_turned, self.none_s = False, 0.0
+        else:
+            self.none_s += block.s
+        if before < NONE_S <= self.none_s:
+            left, right = commands
+            figures = f"(commanded {left:.2f} and {right:.2f}, measured 0 rad/s)"
+            self.fault = joined(reason("no_wheel_moves", seconds=NONE_S, figures=figures))
 
     def _pace(self, i: int, wheel: Wheel, expected: Rad, block: Block) -> None:
         s, angle, peak = block.s, block.angles[i], self.sides[SIDE_OF[i]].peak
@@ -339,7 +365,7 @@ class Wheels(Struct):
                 self._latch("wheel_runaway", i, command)
         elif goes_on and abs(speed) >= AGREEMENT * abs(command):
             self._latch("wheel_reversed", i, command)
-        elif off * command < 0.0 and abs(speed) < AGREEMENT * abs(command):
+        elif off * command < 0.0 and abs(speed) < AGREEMENT * abs(command) and not self.none_s:
             self._warn(i, wheel, "wheel_blocked")
 
     def _are_swapped(self, i: int) -> bool:
