@@ -29,7 +29,7 @@ HOUR_NS = 3600 * NS
 """The least delay may rise by one timeout in this time. A clock that was silent for it is new."""
 
 REMEMBERED = 16
-"""Clocks of one source that the robot remembers, first those that it uses."""
+"""Clocks of one source that the robot remembers: it forgets those that it does not refuse."""
 
 
 class Wish:
@@ -79,6 +79,8 @@ class Clock:
         """The lowest value that such commands may have given to the robot's least delay."""
         self.known: Clock | None = None
         """The same clock if the robot has not forgotten it for others."""
+        self.refused = False
+        """Its last command was refused for its age, so the robot never forgets it for others."""
 
     def take(self, at_ns: int, delay_ns: int, timeout_ns: int) -> bool:
         """Return whether a command with this delay may count."""
@@ -156,7 +158,8 @@ class Ages:
         clock, others = self._clocks.get(key), self._number.get(sender["source"], 0)
         if clock is not None and arrived_ns - clock.last_ns > HOUR_NS - NS:
             clock = None
-        if clock is None or others - clock.others > REMEMBERED:
+        full = clock is not None and others >= REMEMBERED and others > clock.others
+        if clock is None or (full and not clock.refused):
             others = self._number[sender["source"]] = others + 1
             new = self._clocks[key] = Clock(arrived_ns, delay_ns, others)
             new.known = clock and (clock.known or clock)
@@ -165,4 +168,5 @@ class Ages:
             new, fresh = clock, clock.take(arrived_ns, delay_ns, timeout_ns)
         new.others = others
         known = new.known is not None and new.known.take(arrived_ns, delay_ns, timeout_ns)
+        new.refused = new.counted and not (fresh or known)
         return fresh or known
