@@ -16,7 +16,6 @@ from acsard.checkup import motion, outcomes
 from acsard.checkup.board import Board, Operator
 from acsard.checkup.findings import Finding, motor_name, wheel_of, with_spaces
 from acsard.checkup.motion import (
-    MOVING_SPEED,
     PROBE_MOVING_SPEED,
     SHORT_MEASUREMENT_S,
     SPEED,
@@ -101,9 +100,12 @@ class Channel(Struct, frozen=True):
 
     @property
     def follows(self) -> bool:
-        """Whether the own encoder moved as commanded in both directions, alone or not."""
-        own = self.motor
-        return self.judged and self.forth[own] >= MOVING_SPEED and self.back[own] <= -MOVING_SPEED
+        """Whether the own encoder moved as commanded in both directions, alone or not.
+
+        Coupled with another one, it turns half as fast; a slower motor shows no watchdog.
+        """
+        own, least = self.motor, 0.45 * SPEED
+        return self.judged and self.forth[own] >= least and self.back[own] <= -least
 
     @property
     def error(self) -> float:

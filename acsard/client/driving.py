@@ -208,6 +208,7 @@ def _course(begin: Callable[[Odometry], Course]) -> Steps:
             while odom is None:
                 yield COURSE_PERIOD_S
                 driver.take()
+                driver.require()
                 odom = odometer.newest()
                 if sets is None:
                     odom = None
@@ -233,7 +234,7 @@ def _course(begin: Callable[[Odometry], Course]) -> Steps:
                     course.odom(newest)
         yield from driver.stop()
         if driver.poses_set != sets:
-            raise NotDrivenError(POSE_SET.format("an unknown way"))
+            raise NotDrivenError("the pose was set at the end of the drive: where is the robot?")
 
     return steps
 

@@ -141,7 +141,7 @@ too_many_clocks
 stalled
     the daemon stalled: waiting for the next command of {source}
 neutral
-    send a zero first: {source} must send a zero{alone}{pause} before it can drive{lasts}{ros}
+    send a zero first: {source} must send a zero{alone} before it can drive{lasts}{ros}
 zeros
     {source} commands zero speed: it has sent only zeros for over 3 s{note}
 higher

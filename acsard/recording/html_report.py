@@ -164,9 +164,9 @@ class Drawing:
         match message:
             case Odometry():
                 self._odometry(t, message)
-            case JointState():
-                self.wheels.add(t, *wheels4(message.velocity))
-                self.wheel_names = wheel_names(len(message.velocity))
+            case JointState(velocity=[_, _, *_] as velocity):
+                self.wheels.add(t, *wheels4(velocity))
+                self.wheel_names = wheel_names(len(velocity))
             case TwistStamped(twist=twist):
                 name = f"commanded by {item.source}" if item.source else "limited"
                 self.speeds[name].add(t, twist.linear.x, twist.angular.z)

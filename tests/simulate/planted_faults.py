@@ -175,7 +175,7 @@ FAULTS = (
     fault("ages proof", "the second command of a new clock counts", AGES,
           "elif at_ns - self.since_ns >= timeout_ns:", "elif at_ns > self.since_ns:"),
     fault("ages silence", "a sender stays armed through any silence", NEUTRAL,
-          "now_ns - self.arrived_ns > self.silent_ns", "now_ns - self.arrived_ns > 10**15"),
+          "now_ns - self.arrived_ns > SILENT_NS", "now_ns - self.arrived_ns > 10**15"),
     fault("neutral anywhere", "a pause arms a sender of each source", ARBITER,
           "if pauses and not zero and not sender.is_armed(now_ns):",
           "if not zero and not sender.is_armed(now_ns):"),

@@ -62,9 +62,6 @@ WAITED_NS = NS // 10 - MARGIN_NS
 PAUSE_NS = NS - MARGIN_NS
 """A silence of this length may arm a sender of a source whose senders pauses arm."""
 
-NUMBERED = ("client", "page", "signed", "rmw")
-"""Ways on which each command has a number; those of rmw begin with 1."""
-
 LOOK_NS = 2 * NS
 """A call without numbers is refused for this time, in which its sender may not know the cause."""
 
@@ -268,12 +265,11 @@ class Witness:
         if arrived_ns - known.heard_ns > SILENT_NS:
             known.armed_ns = -1
             known.zeros.clear()
-        numbered = not sample.shared and sender["way"] in NUMBERED
-        if source in self.pausing and numbered and arrived_ns - known.heard_ns > PAUSE_NS:
-            # Nothing was sent since a zero, or ever.
-            begun = known.number > 0 or sender["way"] == "rmw"
-            if begun and known.rests and message.number == known.number + 1:
-                known.armed_ns = arrived_ns
+        numbered = not sample.shared and sender["way"] == "rmw"
+        # Nothing was sent since a zero, or ever.
+        follows = numbered and known.rests and message.number == known.number + 1
+        if source in self.pausing and follows and arrived_ns - known.heard_ns > PAUSE_NS:
+            known.armed_ns = arrived_ns
         if numbered and message.number > known.number:
             known.number, known.rests = message.number, zero
         waits = sample.shared or (source in self.pausing and sender["way"] == "rmw")

@@ -12,10 +12,12 @@ import zenoh
 from acsard.core.incoming.commands import Arrival
 from acsard.core.incoming.queries import Reply
 from acsard.core.messages.keys_and_roles import IMU
+from acsard.core.values import BRIDGES
 from acsard.daemon.bus.inbox import (
     COMMAND_BUFFER,
     MAX_DISPLACED,
     MAX_OPEN_QUERIES,
+    MAX_TOKENS,
     Inbox,
     Replies,
 )
@@ -202,3 +204,31 @@ def test_the_number_of_tickets_is_limited_until_some_are_retired() -> None:
     ended(replies)
     assert all(query.told == ["dropped"] for query in queries[: len(open_tickets)])
     assert replies.issue(queries[-1], "") is not None  # type: ignore[arg-type]
+
+
+def tokens(inbox: Inbox, kind: Any, *names: str, transport: Any = "rmw") -> None:
+    """Let the tokens of publishers for `nav` appear or disappear, as a thread of Zenoh does."""
+    for name in names:
+        sample: Any = SimpleNamespace(key_expr=name, kind=kind)
+        inbox.on_token("nav", transport, sample)
+
+
+def test_all_bridges_are_one_sender_and_each_change_of_them_counts() -> None:
+    inbox, _ = an_inbox()
+    put, delete = zenoh.SampleKind.PUT, zenoh.SampleKind.DELETE
+    seen = []
+    for kind, name in ((put, "one"), (put, "two"), (delete, "one"), (delete, "two")):
+        tokens(inbox, kind, name, transport="bridge")
+        (news,) = inbox.take(8).announced
+        seen.append((news.sender, news.present))
+    assert seen == [(BRIDGES, True)] * 3 + [(BRIDGES, False)]
+
+
+def test_a_flood_of_tokens_never_hides_that_a_publisher_is_gone() -> None:
+    inbox, _ = an_inbox()
+    tokens(inbox, zenoh.SampleKind.PUT, "bridge", transport="bridge")
+    tokens(inbox, zenoh.SampleKind.PUT, *[f"flood {number}" for number in range(2 * MAX_TOKENS)])
+    tokens(inbox, zenoh.SampleKind.DELETE, "bridge", transport="bridge")
+    news = {each.sender: each.present for each in inbox.take(8).announced}
+    assert len(news) == MAX_TOKENS
+    assert news[BRIDGES] is False

@@ -15,7 +15,7 @@ from tests import recordings
 PACKAGE = Path(acsard.__file__).parent
 
 VALUES = {
-    "source": "app", "seconds": 0.5, "alone": "", "pause": "", "lasts": "", "ros": "", "note": "2",
+    "source": "app", "seconds": 0.5, "alone": "", "lasts": "", "ros": "", "note": "2",
     "firmware": "", "others": "2 other senders", "bumpers": "front bumper pressed",
     "direction": "backwards",
     "speed": 0.1, "by": "ann", "cause": "why", "places": "1 place", "dots": ".",

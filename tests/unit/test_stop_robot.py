@@ -102,7 +102,7 @@ def test_the_token_of_a_bridge_and_its_silence_arm_it_where_a_pause_does() -> No
     rig = Rig(REAL).linked()
     token = Announcement("nav", BRIDGES, present=True, at_ns=rig.now_ns)
     rig.step(announced=(token,))
-    for wait_ms, mode in ((10_900, "ready"), (11_000, "driving")):
+    for wait_ms, mode in ((9_900, "ready"), (10_100, "driving")):
         for _ in range(wait_ms // 10):
             rig.step()
         command = Command(

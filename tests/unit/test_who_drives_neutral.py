@@ -46,18 +46,19 @@ PAUSE = {
     "then it arms": "pause.a#7 zero; 500 pause.a#8 zero; 500 pause.a#9 go > pause.a",
     "a zero of one with an id does not wait": "pause.a zero; pause.a go > pause.a",
     "not on a plain key": "pause.a go > -; 100000 pause.a go > -; 100000 pause.a* go > -",
-    "a bridge that was there, and silent": "+pause; 11000 pause.a^ go > pause.a",
-    "not sooner than its lease": "+pause; 10999 pause.a^ go > -",
+    "a bridge that was there, and silent": "+pause; 10000 pause.a^ go > pause.a",
+    "not sooner than its lease": "+pause; 9999 pause.a^ go > -",
     "not without its token": "11000 pause.a^ go > -; +pause; -pause; 20000 pause.a^ go > -",
     "not while another one speaks": "+pause; 6000 pause.b^ go; 6000 pause.a^ go > -",
     "not if a second bridge came": "+pause; 6000 +pause; 6000 pause.a^ go > -",
-    "nor if one of two went": "+pause; +pause; 6000 -pause; 10999 pause.a^ go > -",
-    "not if the daemon stood still": "wake; +pause; 10000 wake; 2000 pause.a^ go > -",
+    "nor if one of two went": "+pause; +pause; 6000 -pause; 9999 pause.a^ go > -",
+    "not if the daemon stood still": "wake; +pause; 9000 wake; 2000 pause.a^ go > -",
     "between zero and proof": "+pause; pause.a^ zero; 11000 pause.a^ go > pause.a",
     "a publisher of before": "+pause.a; 61000 pause.a#500 go > pause.a",
     "not sooner than the lease of rmw": "+pause.a; 60999 pause.a#500 go > -",
     "not by the token of another": "+pause.b; 61000 pause.a#500 go > -",
     "not while its numbers tell more": "+pause.a; pause.a#5 go; 61000 pause.a#7 go > -",
+    "not by a native number": "pause.a zero; reset; 1000 pause.a go > -",
 }
 
 
@@ -71,6 +72,15 @@ def test_a_bridged_sender_that_was_replaced_has_spoken_all_the_same() -> None:
     for number in range(MAX_SENDERS):
         one.play(f"pause.{number} go")
     one.play("6000 pause.a^ go > -; 11000 pause.a^ go > pause.a")
+
+
+def test_a_publisher_that_was_replaced_or_unreadable_was_not_silent() -> None:
+    one = Commanders().play("+pause.a; pause.a#500 go; 61000 pause.a#501 go > -")
+    for number in range(MAX_SENDERS):
+        one.play(f"pause.{number} go")
+    one.play("20 pause.a#519 go > -")
+    one = Commanders().play("+pause.a; 61000 pause.a nan ! not_finite; 100 pause.a#500 go > -")
+    one = Commanders().play("+pause.a; 61000 pause.a unreadable; 100 pause.a#500 go > -")
 
 
 def test_no_number_of_tokens_takes_memory_for_ever() -> None:

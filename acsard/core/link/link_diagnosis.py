@@ -162,6 +162,8 @@ class Traffic(Struct):
     def wheels(self) -> str:
         """What to do about a board that names other motors than the configuration, as text."""
         motors = self.motors
+        if not motors:
+            return ""
         if len({*motors}) < len(motors):
             return "the firmware must name each motor once"
         names = WHEELS if len(motors) == len(WHEELS) else TWO_WHEELS[::-1]

@@ -91,6 +91,7 @@ class Clock(Struct):
     accepted_ns: Ns = 0  # stamp of the last accepted command
     low: int = 0  # lowest delay of a proof
     since_ns: Ns | None = None  # a proof runs, in which the delay has not fallen since then
+    late: bool = False  # a command since the last accepted one was refused for its age
     first_refused: tuple[Ns, Ns] | None = None  # arrival and stamp of the first refused command
     cause: AgeVerdict = ""  # of refusals that last
     advance: float = 0.0  # of the stamps, s per second, while refusals last
@@ -106,13 +107,14 @@ class Clock(Struct):
         else:
             self.since_ns, self.behind = None, delay - least
             verdict = "stale" if delay - least > timeout_ns else ""
+        self.late = self.late or (verdict == "stale" and least is not None)
         if still:
             verdict, self.advance = "stamps", 0.0
         elif not verdict and stamp_ns <= self.accepted_ns:
             verdict = "not_newer"
         if verdict:
             return self._lasting(verdict, at_ns, stamp_ns)
-        self.accepted_ns, self.first_refused, self.cause = stamp_ns, None, ""
+        self.accepted_ns, self.late, self.first_refused, self.cause = stamp_ns, False, None, ""
         self.least = delay if self.least is None else min(self.least, delay)
         if not self.lows or at_ns - self.slot_ns >= SLOT_NS:
             self.lows, self.slot_ns = [*self.lows[-(MEMORY_NS // SLOT_NS) :], self.least], at_ns
@@ -121,8 +123,7 @@ class Clock(Struct):
 
     def may_go(self, now_ns: Ns) -> bool:
         """Return whether the clock shows nothing that must be remembered."""
-        refused = self.least is not None and self.first_refused is not None
-        return not refused or now_ns - self.at_ns > MEMORY_NS
+        return not self.late or now_ns - self.at_ns > MEMORY_NS
 
     def _risen(self, at_ns: Ns, timeout_ns: Ns) -> int | None:
         if self.least is None or not self.lows:

@@ -67,7 +67,7 @@ class SourceSenders(Struct):
 
     senders: dict[str, Sender] = {}
     ages: Ages = field(default_factory=Ages)
-    forgot_ns: Ns = 0  # last message of a sender that was replaced
+    forgot_ns: Ns = 0  # last message of a sender that was replaced, or that never had a place
     # Since when the token of a sender is there; of all bridges, since the last change.
     announced: dict[str, Ns] = {}
 
@@ -105,7 +105,7 @@ class SourceSenders(Struct):
             others = [each.seen_ns for each in self.senders.values() if each.bridged]
             name, quiet_ns, lease_ns = BRIDGES, max([self.forgot_ns, *others]), BRIDGE_LEASE_NS
         elif command.ros and not sender.number:
-            name, quiet_ns, lease_ns = command.sender, 0, RMW_LEASE_NS
+            name, quiet_ns, lease_ns = command.sender, self.forgot_ns, RMW_LEASE_NS
         else:
             return False
         announced_ns = self.announced.get(name)
@@ -178,8 +178,6 @@ class Arbiter(Struct):
         if pauses and not zero and not sender.is_armed(now_ns):
             neutral = source.was_silent(sender, command, self.resumed_ns)
         sender.receive(command)
-        if pauses and command.bridged and BRIDGES in source.announced:
-            sender.silent_ns = BRIDGE_LEASE_NS  # from then on its silence may be proved
         if now_ns - sender.refused_ns > SILENT_NS:
             sender.hint = None  # silence disarms also a sender whose zero was not proven yet
         if command.shared and not zero:
@@ -228,6 +226,8 @@ class Arbiter(Struct):
         self.until_ns = 0
         known_source = self.sources.get(source)
         known = None if known_source is None else known_source.senders.get(sender)
+        if known_source is not None and known is None:
+            known_source.forgot_ns = max(known_source.forgot_ns, arrived_ns)
         if known is not None:
             known.seen_ns = max(known.seen_ns, arrived_ns)
             known.cancel_zero(arrived_ns)

@@ -53,8 +53,9 @@ def waiting(wait: Wait) -> Reason:
             return sentence(
                 "neutral",
                 source=wait.source,
-                alone=f", and then no speed for {wait.seconds:g} s," if wait.shared else "",
-                pause=f", or nothing for {wait.seconds:g} s," if wait.pause else "",
+                alone=f", and then no speed for {wait.seconds:g} s,"
+                if wait.shared or (wait.pause and wait.ros)
+                else "",
                 lasts="; it has sent speeds for over 3 s" if wait.lasts else "",
                 ros=ROS_NEVER if wait.ros else "",
             )

@@ -7,14 +7,21 @@ ends, if it is shorter than `MAX_FILLED_GAP_S`. Otherwise its motion is unknown,
 
 from __future__ import annotations
 
+import math
+
 from msgspec import Struct
 
+from acsard.core.link.coarse_encoders import MIN_COUNT_S
 from acsard.core.link.feedback import MAX_FILLED_GAP_S, Line
-from acsard.core.values import Seconds, Wheels4
+from acsard.core.values import RadPerS, Seconds, Wheels4
 
 # By the number of driven wheels: a line for more than this is judged like a gap. A false speed of
 # one wheel is a quarter of the motion, or half of it.
 LONG_S = {4: 0.06, 2: 0.03}
+
+# By which a sound speed leaves the range from its last one to its command: a share, by slopes and
+# overshoot, and a count of an encoder with unknown counts.
+ROUGHLY, ASSUMED_COUNT = 0.3, math.tau / 400
 
 AT_REST: Wheels4 = (0.0, 0.0, 0.0, 0.0)
 
@@ -68,8 +75,9 @@ def rolled_over(skipped: Skipped, line: Line, before: Wheels4, commanded: Wheels
     if filled:
         angles = plus(angles, times(plus(before, speeds), filled / 2))
     alone = AT_REST
-    if commanded is not None and line.turned is None:
-        beyond = _beyond(before, speeds, commanded)
+    if commanded is not None and line.by_counts is None:
+        count = (line.count or ASSUMED_COUNT) / max(line.dt, MIN_COUNT_S)
+        beyond = _beyond(before, speeds, commanded, count)
         alone = times(beyond, line.dt - line.bridged + filled / 2)
     return Rolled(angles, seconds + filled, filled, unknown, alone)
 
@@ -86,13 +94,17 @@ def _confirmed(before: Wheels4, after: Wheels4) -> Wheels4:
     )  # fmt: skip
 
 
-def _beyond(before: Wheels4, after: Wheels4, commanded: Wheels4) -> Wheels4:
-    # A wheel turns at a speed between its last one and its command. If it is alone on its side, no
-    # other value outvotes a damaged one beyond both: the pose takes it, and doubts it as much.
-    fr, fl, rl, rr = [
-        now - min(max(now, min(was, wish)), max(was, wish))
-        for was, now, wish in zip(before, after, commanded, strict=True)
-    ]
+def _beyond(before: Wheels4, after: Wheels4, commanded: Wheels4, count: RadPerS) -> Wheels4:
+    # A wheel turns at a speed between its last one and its command, roughly and but for a count. If
+    # it is alone on its side, no other value outvotes a damaged one far beyond both: the pose takes
+    # it, and doubts it as much.
+    found = []
+    for was, now, wish in zip(before, after, commanded, strict=True):
+        low, high = sorted((was, wish))
+        beyond = now - min(max(now, low), high)
+        usual = ROUGHLY * max(abs(now), abs(was), abs(wish)) + count
+        found.append(beyond if abs(beyond) > usual else 0.0)
+    fr, fl, rl, rr = found
     return fr, fl, rl, rr
 
 

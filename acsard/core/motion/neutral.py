@@ -4,11 +4,11 @@ A zero arms. If several programs may share the identity, the zero arms when no s
 for `NEUTRAL_PAUSE_NS`. Where the source says `neutral_first = "pause"`, this holds for all of ROS,
 and silence arms too, but only silence that is proved to be the sender's and not the network's:
 
-- a sender that numbers its commands: its last message was a zero, and the next number follows.
+- a publisher of rmw_zenoh: its last message was a zero, or it sent none, and its number follows.
 - any other ROS publisher: its liveliness token was there without a message for so long that a lost
   network would have ended it. It says nothing sooner, because a token stays for its lease.
 
-`require_neutral` disarms, and so does silence of `silent_ns`.
+`require_neutral` disarms, and so does silence of `SILENT_NS`.
 """
 
 from __future__ import annotations
@@ -23,8 +23,9 @@ from acsard.core.values import NS_PER_S, REST, Command, Ns, Twist, Wait
 # any message where a pause arms.
 NEUTRAL_PAUSE_NS = NS_PER_S
 
-# The longest lease on the way, and a second: of a bridge, and of a session of rmw_zenoh.
-BRIDGE_LEASE_NS, RMW_LEASE_NS = 11 * NS_PER_S, 61 * NS_PER_S
+# The longest lease on the way: of a bridge, from whose end on silence disarms, and of a session of
+# rmw_zenoh, with a second.
+BRIDGE_LEASE_NS, RMW_LEASE_NS = SILENT_NS, 61 * NS_PER_S
 
 FOREVER_NS = 1 << 62
 
@@ -47,7 +48,6 @@ class Sender(Struct):
     bridged: bool = False  # by a bridge of ROS
     number: int = 0  # the highest one that was received
     rests: bool = True  # the message with this number was a zero, or none has come
-    silent_ns: Ns = SILENT_NS  # without an accepted command, which disarm
     ros: bool = False  # the last command came from ROS, whose tools send no zero by themselves
     twist: Twist = REST
     arrived_ns: Ns | None = None  # last accepted command since `require_neutral`
@@ -72,7 +72,7 @@ class Sender(Struct):
         return self.arrived_ns is not None and now_ns - self.present_ns <= timeout_ns
 
     def is_armed(self, now_ns: Ns) -> bool:
-        if self.arrived_ns is None or now_ns - self.arrived_ns > self.silent_ns:
+        if self.arrived_ns is None or now_ns - self.arrived_ns > SILENT_NS:
             return False
         return self.armed or (
             self.zero_ns is not None and now_ns - self.zero_ns >= NEUTRAL_PAUSE_NS
@@ -91,7 +91,7 @@ class Sender(Struct):
             arrived_ns + timeout_ns + 1,
             self.present_ns + timeout_ns + 1,
             self.refused_ns + timeout_ns + 1,
-            arrived_ns + self.silent_ns + 1,
+            arrived_ns + SILENT_NS + 1,
             zero_ns + NEUTRAL_PAUSE_NS,
         ):
             if now_ns < time_ns < next_ns:
@@ -115,8 +115,8 @@ class Sender(Struct):
 
         A publisher of rmw_zenoh counts from 1, so nothing was sent before its first command.
         """
-        known = self.number > 0 or command.ros
-        return known and not command.shared and self.rests and command.sequence == self.number + 1
+        numbered = command.ros and not command.shared
+        return numbered and self.rests and command.sequence == self.number + 1
 
     def cancel_zero(self, at_ns: Ns) -> None:
         """Cancel a zero, because another program of a shared identity may have sent a speed."""

@@ -242,7 +242,8 @@ class Inbox:
             bridges = self._bridges.setdefault(source, set())
             (bridges.add if present and len(bridges) < MAX_TOKENS else bridges.discard)(token)
             present = bool(bridges)
-        if len(self._announced) < MAX_TOKENS or (source, sender) in self._announced:
+        # A flood may hide that a publisher is there, but never that one is gone.
+        if not present or len(self._announced) < MAX_TOKENS or (source, sender) in self._announced:
             at_ns = clock.now().mono_ns
             self._announced[source, sender] = Announcement(source, sender, present, at_ns)
             self._any = True
