@@ -252,7 +252,7 @@ def _rules(keys: _Keys) -> list[Rule]:
         *rules,
         # A router has the role maintainer, and forwards the tokens of other daemons:
         _rule("appear", "ingress", ["liveliness_token"], [keys.alive, *keys.claims]),
-        # A ROS publisher of commands is there, which helps to arm it:
+        # A ROS publisher of commands announces itself, and then its silence may arm it:
         _rule("announce", "ingress", ["liveliness_token"], keys.publishers),
         # A client without a certificate commands, and a router forwards commands:
         _rule("command", "ingress", ["put"], keys.commands),

@@ -178,8 +178,8 @@ class Command(Struct, frozen=True, omit_defaults=True):
 class Announcement(Struct, frozen=True):
     """A liveliness token of a ROS publisher on the topic of a source has appeared or disappeared.
 
-    `sender` is the public name that its commands have, or `BRIDGES` for any change of the bridges
-    with such a publisher: `present` says whether there is one.
+    `sender` is the public name of its commands. For `BRIDGES`, a bridge with such a publisher came
+    or went, and `present` says whether there is still one.
     """
 
     source: str

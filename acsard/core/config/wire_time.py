@@ -34,7 +34,7 @@ def wire_ns(count: int, baud_rate: int) -> Ns:
 
 
 def plain_bytes(motors: int) -> int:
-    """Return the bytes of a plain line for so many motors, such as `lp08.75,rp12.50` and CR LF."""
+    """Return the bytes of a plain line with its end, such as 17 for `lp08.75,rp12.50`."""
     return TOKEN_BYTES * motors + END_BYTES
 
 

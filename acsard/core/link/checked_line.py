@@ -59,7 +59,7 @@ def seal(line: bytes, sequence: int, letters: bytes = b"") -> bytes:
 
 
 def unseal(line: bytes, motors: int) -> Checked:
-    """Split a checked reply of so many motors, without its line end, into its parts.
+    """Split a checked reply of this number of motors, without its line end, into its parts.
 
     Raises `FrameError`.
     """

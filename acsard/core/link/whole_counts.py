@@ -38,7 +38,7 @@ AT_REST: Wheels4 = (0.0, 0.0, 0.0, 0.0)
 
 
 class WholeCounts(Struct):
-    """Recovers whole encoder counts from the speeds of four wheels, line by line.
+    """Recovers whole encoder counts from the speeds of the wheels, line by line.
 
     If T is longer than the host's estimate, the next estimate is reduced by the difference. So the
     next line corrects a wrong n, and no time is lost or counted twice. Firmware that filters its

@@ -53,7 +53,7 @@ class BoardInput(Struct):
     state: EstopState = ""  # "" if never reported
     pressed: tuple[bool, ...] | None = None  # None if never reported
     awaited: bool = True  # until the board on the newly opened port reports the inputs
-    lent: bool = False  # the port is or was, and there was no link since then
+    lent: bool = False  # the port is lent, or the link was not up since the loan
     pressed_now: Reason | None = None  # by the last `process_reports`
     reported_ns: Ns = 0
     excused: bool = False  # a late step, since the last report

@@ -1,4 +1,4 @@
-"""Converts between the twist and the wheel speeds of a four-wheel differential-drive base.
+"""Converts between the twist and the wheel speeds of a differential-drive base.
 
     (1)  left = (front_left + rear_left) / 2      right = (front_right + rear_right) / 2
     (2)  v = (r_r right + r_l left) / 2

@@ -19,8 +19,7 @@ from msgspec.structs import replace
 from acsard.core.motion.ages import SILENT_NS, Order
 from acsard.core.values import NS_PER_S, REST, Command, Ns, Twist, Wait
 
-# Longer than the pauses of irregular senders: without a speed behind a zero that waits, or without
-# any message where a pause arms.
+# Longer than the pauses of irregular senders.
 NEUTRAL_PAUSE_NS = NS_PER_S
 
 # The longest lease on the way: of a bridge, from whose end on silence disarms, and of a session of

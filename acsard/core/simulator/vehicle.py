@@ -1,4 +1,4 @@
-"""Simulates the robot: four motors with lag, and the motion of the base on the floor.
+"""Simulates the robot: motors with lag, and the motion of the base on the floor.
 
 A motor is a first-order system. The true track, which `[sim]` can make different from `[drive]`,
 gives the motion.
