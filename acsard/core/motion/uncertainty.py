@@ -159,7 +159,8 @@ class ErrorModel:
         short = min(seconds, MAX_FILLED_GAP_S)  # then the robot was stopped
         quantum = 2 * (self.unsettled / 2 / period * short) ** 2
         if self.independent == 2:
-            # A count is missed in the gap, too: in one lost line, it is five times the above.
+            # A count is missed in the gap, too: in one lost line, it is five times the above. With
+            # four wheels, the factor of a slip behind a gap covers it.
             count = self.unsettled / 2
             quantum = (count / period * short + count) ** 2 + count**2
         along = min(acceleration.linear * short / 4, speed.linear) * short
