@@ -49,7 +49,9 @@ NEARER, MOST_NEARER = 0.01, 0.01
 
 POSES_SET = "poses_set"  # counter in `state`
 
-POSE_SET = "the pose was set during the drive, when {} was left: drive the rest of the way anew"
+POSE_SET = "the pose was set during the drive: see where the robot is, and drive the rest anew"
+
+STARTED = "the daemon was started anew during the drive: see where the robot is"
 
 CONNECTION_CLOSED = "the connection to the daemon was closed while the robot was driving"
 
@@ -220,7 +222,7 @@ def _course(begin: Callable[[Odometry], Course]) -> Steps:
                 driver.step(course.twist if fresh else None)
                 driver.require()
                 if driver.poses_set != sets:
-                    raise NotDrivenError(POSE_SET.format(course.left_text))
+                    raise NotDrivenError(POSE_SET if driver.poses_set > (sets or 0) else STARTED)
                 left = abs(course.left)
                 if driver.ride.begun is None or left < nearest - min(NEARER * nearest, MOST_NEARER):
                     nearest, nearer = left, now
@@ -234,7 +236,7 @@ def _course(begin: Callable[[Odometry], Course]) -> Steps:
                     course.odom(newest)
         yield from driver.stop()
         if driver.poses_set != sets:
-            raise NotDrivenError("the pose was set at the end of the drive: where is the robot?")
+            raise NotDrivenError(POSE_SET if driver.poses_set > (sets or 0) else STARTED)
 
     return steps
 

@@ -295,3 +295,27 @@ def test_motors_that_lose_their_power_slow_down_and_latch_nothing(wheels: WheelM
         world.hold(0.5, seconds=3.0)
     assert world.state.mode == "driving"
     assert "is blocked, or has no power" in world.state.wheel_fault
+
+
+@four_and_two
+@pytest.mark.parametrize("fault", ["reversed_encoder", "frozen_encoder"])
+def test_what_a_wheel_with_a_latched_fault_falsified_is_in_the_covariance(
+    fault: str, wheels: WheelMap
+) -> None:
+    """All encoders of the right side lie; then the robot stands for some seconds."""
+    world = World(Config(mcu=McuConfig(wheels=wheels)))
+    world.drive(0.3, seconds=2.0)
+    right = [
+        wheels.letters.index(motor[1]) for motor in wheels.motors if motor in ("+a", "+d", "+r")
+    ]
+    with ExitStack() as lies:
+        for motor in right[: 1 if fault == "frozen_encoder" else 2]:
+            lies.enter_context(world.mcu.fault(fault, motor))
+        world.hold(0.3, seconds=2.0)
+        world.hold(0.0, seconds=6.0)
+    assert world.state.mode == "fault"
+    true, odom = world.mcu.vehicle.pose, world.odom
+    covariance, position = odom.pose.covariance, odom.pose.pose.position
+    off = position.x - true.x, position.y - true.y, world.mcu.vehicle.turned - odom.yaw
+    for error, variance in zip(off, (covariance[0], covariance[7], covariance[35]), strict=True):
+        assert min(abs(error), 7.0) <= 4.0 * math.sqrt(variance) + 0.01

@@ -57,7 +57,7 @@ class Sender:
         """Arrival of its last command."""
         self.number = 0
         """The highest number that arrived."""
-        self.rests = True
+        self.rests = False
         """The command with this number was a zero, or none has arrived."""
 
 

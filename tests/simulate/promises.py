@@ -266,7 +266,7 @@ class Witness:
             known.armed_ns = -1
             known.zeros.clear()
         numbered = not sample.shared and sender["way"] == "rmw"
-        # Nothing was sent since a zero, or ever.
+        # Nothing was sent since a zero.
         follows = numbered and known.rests and message.number == known.number + 1
         if source in self.pausing and follows and arrived_ns - known.heard_ns > PAUSE_NS:
             known.armed_ns = arrived_ns

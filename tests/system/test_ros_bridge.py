@@ -106,12 +106,14 @@ def test_silence_arms_nav_only_if_it_is_proved_to_be_the_sender_s(tmp_path: Path
         bus.linked()
         with session_at(daemon.endpoint) as session:
             if way == "rmw":
-                goal, first = RmwClient(session), RmwClient(session)
+                goal = RmwClient(session)
                 goal._sequence = 5000  # under way before the network was up
                 put_for(goal, 3.0)
                 assert bus.stands()["x"] == 0.0
                 assert bus.state()["code"] in ("neutral", "no_command", "command")
-                put_for(first, 1.0)  # a publisher that has sent nothing before
+                goal.put("cmd_vel", TWIST, twist(0.0))  # it ends
+                time.sleep(11.0)
+                put_for(goal, 1.0)  # another one
                 assert bus.state()["x"] > 0.1
                 return
             ros, (zid,) = BridgeHalf(session), (str(session.zid()),)

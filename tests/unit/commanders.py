@@ -108,7 +108,7 @@ class Commanders:
             did, _, driver = did.partition(">")
             did, _, refused = did.partition("!")
             words = did.split()
-            if words and words[0].replace(".", "").isdigit():
+            if words and words[0].lstrip("-").replace(".", "").isdigit():
                 self.wait(float(words.pop(0)))
             match words:
                 case ["reset"]:

@@ -32,8 +32,9 @@ SHARED = {
     " ? high neutral",
 }
 PAUSE = {
-    "the first command of a publisher": "pause.a#1 go > pause.a",
-    "not its second, if the first was lost": "pause.a#2 go > - ? pause neutral",
+    "not the first command of a publisher": "pause.a#1 go > - ? pause neutral",
+    "not one before the event of its step": "pause.a#7 zero; 1000 reset; -2 pause.a#8 go; 2 > -",
+    "not if commands behind the zero were lost": "pause.a#7 zero; 1100 pause.a#12 go > -",
     "the successor of a zero": "pause.a#7 zero; 1000 reset; pause.a#8 go > pause.a",
     "hours later, too": "pause.a#7 zero; 7200000 pause.a#8 go > pause.a",
     "not sooner than a second": "pause.a#7 zero; reset; 999 pause.a#8 go > -",
@@ -79,6 +80,15 @@ def test_a_publisher_that_was_replaced_or_unreadable_was_not_silent() -> None:
     for number in range(MAX_SENDERS):
         one.play(f"pause.{number} go")
     one.play("20 pause.a#519 go > -")
+    one = Commanders()
+    for number in range(MAX_SENDERS):
+        one.play(f"pause.{number} zero")
+    one.play("+pause.a")
+    for step in range(310):
+        for number in range(MAX_SENDERS):
+            one.play(f"pause.{number} zero")
+        one.play(f"100 pause.a#{500 + step} go ! too_many_senders; 100")
+    one.play("500 pause.a#900 go > -")
     one = Commanders().play("+pause.a; 61000 pause.a nan ! not_finite; 100 pause.a#500 go > -")
     one = Commanders().play("+pause.a; 61000 pause.a unreadable; 100 pause.a#500 go > -")
 
@@ -163,10 +173,10 @@ def test_a_shared_one_waits_for_its_second_and_a_pause_arms_with_the_proof() -> 
     for _ in range(40):
         one.wait(50).act("high.a*", "go@0")
     one.play("> -; 50 high.a* zero@0; 1000 high.a* go@0 > high.a")
-    one = Commanders().play("pause.a#1 go@0 ! unproven > -")
-    for number in range(2, 6):
+    one = Commanders().play("+pause.a; 61000 pause.a#501 go@0 ! unproven > -")
+    for number in range(502, 506):
         one.play(f"50 pause.a#{number} go@0 ! unproven > -")
-    one.play("50 pause.a#6 go@0 > pause.a")
+    one.play("50 pause.a#506 go@0 > pause.a")
 
 
 def test_what_a_network_held_back_does_not_arm() -> None:

@@ -171,12 +171,15 @@ class Arbiter(Struct):
         now_ns, timeout, zero = command.arrived_ns, timeout_ns(settings), is_zero(command)
         sender = source.senders.get(command.sender) or source.add(command.sender, now_ns, timeout)
         if sender is None:
+            source.forgot_ns = max(source.forgot_ns, now_ns)
             return Wait("too_many_senders", command.source, MAX_SENDERS)
         neutral, pauses = zero and now_ns >= self.since_ns, settings.neutral_first == "pause"
         # A filter of Nav2 sends zeros in mid-goal, such as collision_monitor without transforms.
         waits = command.shared or (pauses and command.ros)
-        if pauses and not zero and not sender.is_armed(now_ns):
-            neutral = source.was_silent(sender, command, self.resumed_ns)
+        if pauses:
+            sender.find_gap(command)
+            if not zero and now_ns >= self.since_ns and not sender.is_armed(now_ns):
+                neutral = source.was_silent(sender, command, self.resumed_ns)
         sender.receive(command)
         if now_ns - sender.refused_ns > SILENT_NS:
             sender.hint = None  # silence disarms also a sender whose zero was not proven yet

@@ -4,7 +4,7 @@ A zero arms. If several programs may share the identity, the zero arms when no s
 for `NEUTRAL_PAUSE_NS`. Where the source says `neutral_first = "pause"`, this holds for all of ROS,
 and silence arms too, but only silence that is proved to be the sender's and not the network's:
 
-- a publisher of rmw_zenoh: its last message was a zero, or it sent none, and its number follows.
+- a publisher of rmw_zenoh: its last message was a zero, and the next number follows.
 - any other ROS publisher: its liveliness token was there without a message for so long that a lost
   network would have ended it. It says nothing sooner, because a token stays for its lease.
 
@@ -16,7 +16,7 @@ from __future__ import annotations
 from msgspec import Struct
 from msgspec.structs import replace
 
-from acsard.core.motion.ages import SILENT_NS, Order
+from acsard.core.motion.ages import SILENT_NS, Order, number
 from acsard.core.values import NS_PER_S, REST, Command, Ns, Twist, Wait
 
 # Longer than the pauses of irregular senders.
@@ -46,7 +46,7 @@ class Sender(Struct):
     shared: bool = False  # several programs may share its identity
     bridged: bool = False  # by a bridge of ROS
     number: int = 0  # the highest one that was received
-    rests: bool = True  # the message with this number was a zero, or none has come
+    rests: bool = False  # the message with this number was a zero
     ros: bool = False  # the last command came from ROS, whose tools send no zero by themselves
     twist: Twist = REST
     arrived_ns: Ns | None = None  # last accepted command since `require_neutral`
@@ -109,13 +109,16 @@ class Sender(Struct):
         if command.sequence is not None and command.sequence > self.number:
             self.number, self.rests = command.sequence, is_zero(command)
 
-    def follows_rest(self, command: Command) -> bool:
-        """Return whether the number of a command proves that nothing was sent since a zero.
+    def find_gap(self, command: Command) -> None:
+        """Cancel a zero that waits if a lost command came behind it: it may have been a speed."""
+        numbered = command.ros and not command.shared and self.number > 0
+        if numbered and not self.armed and number(command) > self.number + 1:
+            self.zero_ns = None
 
-        A publisher of rmw_zenoh counts from 1, so nothing was sent before its first command.
-        """
-        numbered = command.ros and not command.shared
-        return numbered and self.rests and command.sequence == self.number + 1
+    def follows_rest(self, command: Command) -> bool:
+        """Return whether the number of a command proves that nothing was sent since a zero."""
+        numbered = command.ros and not command.shared and self.number > 0
+        return numbered and self.rests and number(command) == self.number + 1
 
     def cancel_zero(self, at_ns: Ns) -> None:
         """Cancel a zero, because another program of a shared identity may have sent a speed."""

@@ -154,6 +154,9 @@ class Odometry(Struct):
                 distance, angle = model.kinematics.moved(angles)
                 angle = 0.0 if turn is not None else angle
                 uncertainty.miss(side, MISSED_STD * distance, MISSED_STD * angle, heading)
+                # With a turn that was missed, too, the distance may have been to any side.
+                aside = (MISSED_STD * distance) ** 2 * min(1.0, angle**2)
+                uncertainty.doubt(aside, 0.0, aside, heading)
         return Estimate(
             line.at, self.pose, self.twist, uncertainty.covariance, uncertainty.twist,
             self.positions, speeds, line.asked_ns, line.heard_ns,

@@ -108,6 +108,7 @@ class Wheel(Struct):
     fast_angle: Rad = 0.0  # rolled beyond what the limiter allows
     pace_s: Seconds = 0.0
     pace_angle: Rad = 0.0
+    doubted: bool = False  # by a latched fault, until it is cleared: the pose may have all of it
     reported: RadPerS = 0.0  # in the last line
     same_s: Seconds = 0.0  # for which it repeats this speed
     warning: Code | None = None
@@ -187,6 +188,8 @@ class Wheels(Struct):
     def forget(self) -> None:
         """Drop the evidence of faults: one was cleared."""
         self._drop()
+        for wheel in self.wheels:
+            wheel.doubted = False
         self._begin()
 
     def believed(self, wheels: Wheels4) -> Wheels4:
@@ -284,6 +287,8 @@ class Wheels(Struct):
             elif not wheel.rested:
                 _rest(wheel, angle, block)
             _follow(wheel, angle, expected[k], block)
+            if wheel.doubted and (more := expected[k] - angle):
+                self._doubt(i, more)
             slack = ROUNDING * s + JITTER_S * abs(speeds[i])
             if speeds[i] == wheel.reported != 0.0 and abs(angle - speeds[i] * s) < slack:
                 wheel.same_s += s
@@ -399,8 +404,19 @@ class Wheels(Struct):
         if self.fault is None:
             figures = f"(commanded {command:.2f}, measured {wheel.speed:.2f} rad/s)"
             self.fault = joined(reason(code, part=name, wheel=name, figures=figures))
+        if not wheel.doubted:
+            wheel.doubted = True
+            self._doubt(i, wheel.missed)
         # Another fault needs new evidence: the robot stops now.
         wheel.off = wheel.away_s = wheel.away_angle = wheel.fast_s = wheel.fast_angle = 0.0
+
+    def _doubt(self, i: int, angle: Rad) -> None:
+        # What a wheel with a latched fault showed otherwise than expected, which the pose has.
+        values = [0.0] * 4
+        values[i] = angle
+        if len(self.wheels) < len(WHEELS):
+            values[3 - i] = angle
+        self.missed = (*self.missed, (self.sides[SIDE_OF[i]].name, _wheels4(values)))
 
     def _warn(self, i: int, wheel: Wheel, code: Code | None) -> None:
         if code == wheel.warning:

@@ -15,6 +15,7 @@ from functools import partial
 from itertools import count
 
 import zenoh
+from msgspec.structs import replace
 
 from acsard.core.incoming.bus_interface import NO_INPUT, BusInput, Waker
 from acsard.core.incoming.commands import Arrival, Via, parts, publisher_name
@@ -182,6 +183,7 @@ class Inbox:
         # The tokens of bridges by source, and the newest change of each sender since `take`.
         self._bridges: dict[str, set[str]] = {}
         self._announced: dict[tuple[str, str], Announcement] = {}
+        self._lost_stops = 0  # displaced ones that `take` has reported
         self._any = False  # set after the item is in its buffer, so `take` overlooks none
         self._waker = waker
 
@@ -201,7 +203,12 @@ class Inbox:
         displaced, self._displaced = self._displaced, {}
         announced, self._announced = self._announced, {}
         arrivals.sort(key=lambda arrival: arrival.arrived_ns)
-        arrivals = self._stops.take() + arrivals
+        stops = self._stops.take()
+        if self._stops.lost != self._lost_stops:
+            # Others have stopped the robot, too: one stop without a name stands for them.
+            self._lost_stops = self._stops.lost
+            stops.append(replace(stops[-1], attachment=b"", sender=""))
+        arrivals = stops + arrivals
         due_queries = _taken_of(self._services, queries) + _taken_of(self._slow, 1)
         due_queries += _taken_of(self._others, queries - len(due_queries))
         if self._services or self._slow or self._others:
