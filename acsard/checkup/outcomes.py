@@ -121,7 +121,7 @@ SKIPPED? checked link: plain | plain
     the firmware answers without a check, so a damaged line can carry a wrong speed
 FAIL? checked link: missing | none
     the firmware answers without a check, but mcu.link_check is on: the robot will not drive
-    -> flash the C firmware of deploy/firmware, or write mcu.link_check = "off"
+    -> flash the C firmware of deploy/firmware (for four motors), or write mcu.link_check = "off"
 
 PASS lost lines: none | none of {lines}
 PASS lost lines: few | {lost} of {lines}

@@ -287,7 +287,7 @@ set_points
 no_checksum
     the microcontroller answers without a checksum, but mcu.link_check = "on" lets the robot drive
     only with one:
-    -> flash the C firmware of deploy/firmware, or write mcu.link_check = "off"
+    -> flash the C firmware of deploy/firmware (for four motors), or write mcu.link_check = "off"
 replies_damaged
     the microcontroller's replies arrive damaged:
     -> check cable and ground

@@ -18,6 +18,7 @@ from acsard.daemon.bus.inbox import (
     MAX_DISPLACED,
     MAX_OPEN_QUERIES,
     MAX_TOKENS,
+    STOP_BUFFER,
     Inbox,
     Replies,
 )
@@ -232,3 +233,13 @@ def test_a_flood_of_tokens_never_hides_that_a_publisher_is_gone() -> None:
     news = {each.sender: each.present for each in inbox.take(8).announced}
     assert len(news) == MAX_TOKENS
     assert news[BRIDGES] is False
+
+
+def test_stops_beyond_the_buffer_leave_one_stop_without_a_name() -> None:
+    inbox, _ = an_inbox()
+    arrived(inbox, *["stop"] * (STOP_BUFFER + 5))
+    stops = inbox.take(8).arrivals
+    assert len(stops) == STOP_BUFFER + 1
+    assert (stops[-1].key, stops[-1].put, stops[-1].attachment) == ("stop", True, b"")
+    arrived(inbox, "stop")
+    assert len(inbox.take(8).arrivals) == 1

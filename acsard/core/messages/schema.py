@@ -442,7 +442,8 @@ class RobotState(Message, frozen=True):
     time.
     """
     wheel_fault: str = ""
-    """Description of a wheel that the odometry ignores, or of a side whose wheels slip.
+    """Description of a wheel that does not obey its command or that the odometry ignores, or of a
+    side whose wheels slip.
 
     It is empty if there is no such wheel or side.
     """
