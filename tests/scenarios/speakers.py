@@ -8,11 +8,11 @@ from typing import Literal, NamedTuple
 
 import msgspec
 
-from acsard.core.incoming.commands import Arrival, Via
+from acsard.core.incoming.commands import Arrival, Via, publisher_name
 from acsard.core.messages.encodings import encode
 from acsard.core.messages.schema import Header, Time, Twist, TwistStamped, Vector3
 from acsard.core.ros.attachments import Attachment
-from acsard.core.values import NS_PER_S
+from acsard.core.values import BRIDGES, NS_PER_S, Announcement
 from tests.scenarios.world import World
 from tests.stepped import Outputs
 
@@ -61,7 +61,7 @@ class Speaker:
         payload = encode(stamped if headed else twist, "cdr")
         attachment, sender, told_ns = b"", "", None
         if way == "rmw":
-            attachment = Attachment(number, stamp_ns, self.name.encode().ljust(16)).pack()
+            attachment = Attachment(number, stamp_ns, self._gid).pack()
         elif way in ("client", "signed"):
             signature = {"sender": self.name, "stamp": stamp_ns, "sequence": number}
             echo = {"echo": {"run": 0, "boot_us": beat_us}} if way == "client" else {}
@@ -80,6 +80,16 @@ class Speaker:
             received_ns=None if sender else world.instant.wall_ns,
         )
         world.bus.arrivals.append(arrival)
+
+    def announce(self) -> None:
+        """Let the liveliness token of this ROS publisher, or that of its bridge, appear."""
+        sender = publisher_name(self._gid) if self.way == "rmw" else BRIDGES
+        token = Announcement(self.key.removeprefix("cmd/"), sender, True, self.world.now_ns)
+        self.world.bus.announced.append(token)
+
+    @property
+    def _gid(self) -> bytes:
+        return self.name.encode().ljust(16)
 
     def send(self, linear: float) -> None:
         """Send a message that arrives at once."""

@@ -141,6 +141,7 @@ class Nav2(Tool):
     ) -> None:
         super().__init__(world, road, name)
         self.key = "cmd/nav"
+        self.announce()
         self._smoother, self._stamps = smoother, stamps
         self._wanted: float | None = None
         self._wanted_ns = self._stamp_ns = 0
@@ -253,8 +254,14 @@ class DiffDrive(Tool):
             self.world.run(0.02)
 
 
-PAUSE = -1.0
-"""Until a zero arms this sender: 1.1 s by the bridge, behind which programs share an identity."""
+PAUSE, SILENCE, ALONE = -1.0, -2.0, -3.0
+PAUSES: dict[float, dict[Road, float]] = {
+    PAUSE: {"rmw": 0.1, "bridge": 1.1},
+    SILENCE: {"rmw": 1.1, "bridge": 10.1},
+    ALONE: {"rmw": 61.1, "bridge": 10.1},
+}
+"""Times that differ by the road: until a zero arms, until silence arms, and until it arms a
+publisher that the daemon has not heard."""
 
 # What is done for how long, and what then holds: `drives`; `rests`: the robot did not move and
 # needs a zero; `cleared`: a stop was cleared meanwhile; `again`: another process of the tool.
@@ -264,13 +271,14 @@ ARMED: Step = ("", 0.0, 1.1)
 
 NAV2_GOAL: Step = ("", 0.0, 0.1)
 EVERY_GOAL: list[Step] = [
-    ("", None, 6.1), GOES, NAV2_GOAL, ("", None, 3.0), GOES, NAV2_GOAL, ("", None, 60.0),
-    ("again", None, 0.0), GOES, NAV2_GOAL, ("", None, 2.0), ("cleared", None, CLEAR_S),
-    ("", None, 1.1), GOES,
+    ("", None, ALONE), GOES, NAV2_GOAL, ("", None, 3.0), GOES, NAV2_GOAL, ("", None, 60.0), GOES,
+    NAV2_GOAL, ("again", None, ALONE), GOES, NAV2_GOAL, ("", None, 2.0),
+    ("cleared", None, CLEAR_S), ("", None, SILENCE), GOES,
 ]  # fmt: skip
 UNDER_WAY: list[Step] = [
-    ("", None, 6.1), GOES, STILL, ("rests", FAST, 3.0), ("", 0.0, 2.0), GOES,
+    ("", None, ALONE), GOES, STILL, ("rests", FAST, 3.0), ("", 0.0, 2.0), GOES,
 ]  # fmt: skip
+TOO_EARLY: list[Step] = [("", None, 6.1), HELD, ("", 0.0, 2.0), GOES]
 
 SMOOTHED = "Nav2 with the velocity smoother"
 NAV2 = (SMOOTHED, True), ("Nav2 without it", False)
@@ -298,7 +306,8 @@ STORIES: list[tuple[str, Any, list[Step]]] = [
         for name, smoother in NAV2
     ),
     *(
-        (name, partial(Nav2, smoother=smoother), UNDER_WAY)
+        (name, partial(Nav2, smoother=smoother), steps)
+        for steps in (UNDER_WAY, TOO_EARLY)
         for name, smoother in NAV2
     ),
     (SMOOTHED, Docking, [("rests", 0.15, 3.0), ("", 0.0, 1.1), ("drives", 0.15, 2.0)]),
@@ -328,7 +337,7 @@ def test_a_tool_drives_after_what_the_page_says_and_not_before(
             tool = kind(world, road, "started again")
         if what == "cleared":
             assert world.call("stop").success
-        tool.use(linear, {"rmw": 0.1, "bridge": 1.1}[road] if seconds == PAUSE else seconds)
+        tool.use(linear, PAUSES[seconds][road] if seconds in PAUSES else seconds)
         if what == "cleared":
             assert world.call("clear").success
         elif what == "rests":

@@ -31,6 +31,7 @@ from acsard.core.simulator.simulated_robot import Observation, WatchedMcu
 from acsard.core.simulator.true_messages import turn_rate
 from acsard.core.values import (
     NS_PER_S,
+    Announcement,
     Estimate,
     Event,
     Instant,
@@ -139,17 +140,20 @@ class MemoryBus:
         self.finished: set[int] = set()
         self.arrivals: list[Arrival] = []
         self.displaced: list[Arrival] = []
+        self.announced: list[Announcement] = []
         self.queries: list[Query] = []
 
     def take(self, queries: int) -> BusInput:
-        if not (self.arrivals or self.queries):
+        if not (self.arrivals or self.queries or self.announced):
             return NO_INPUT
         batch = BusInput(
             tuple(self.arrivals),
             tuple(self.queries[:queries]),
             displaced=tuple(self.displaced),
+            announced=tuple(self.announced),
         )
         self.arrivals.clear()
+        self.announced.clear()
         self.displaced.clear()
         del self.queries[:queries]
         return batch

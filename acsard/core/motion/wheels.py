@@ -411,7 +411,10 @@ class Wheels(Struct):
         wheel.off = wheel.away_s = wheel.away_angle = wheel.fast_s = wheel.fast_angle = 0.0
 
     def _doubt(self, i: int, angle: Rad) -> None:
-        # What a wheel with a latched fault showed otherwise than expected, which the pose has.
+        # What a wheel with a latched fault showed otherwise than expected, which the pose has. Of
+        # a wheel that is left out the pose has nothing, and `possible_motion` covers it.
+        if self.sides[SIDE_OF[i]].out == i:
+            return
         values = [0.0] * 4
         values[i] = angle
         if len(self.wheels) < len(WHEELS):
