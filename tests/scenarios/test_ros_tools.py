@@ -348,6 +348,21 @@ def test_a_tool_drives_after_what_the_page_says_and_not_before(
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("road", ["rmw", "bridge"])
+def test_topic_pub_drives_on_cmd_vel_by_the_bridge_only(road: Road) -> None:
+    """By rmw each run is a publisher that the daemon has not heard, and it speaks at once."""
+    world = World()
+    world.run(0.3)
+    tool = TopicPub(world, road)
+    tool.key = "cmd/nav"
+    tool.announce()
+    for _ in range(2):
+        world.run(PAUSES[ALONE][road])
+        tool.use(FAST, 1.0)
+        assert world.state.mode == ("driving" if road == "bridge" else "ready")
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("road", "other", "least", "most"),
     [("rmw", 0.1, 0.38, 0.42), ("rmw", 0.0, 0.38, 0.42),
