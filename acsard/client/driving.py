@@ -43,6 +43,7 @@ COURSE_PERIOD_S = 0.02  # between two looks at the odometry
 MAX_ODOM_AGE_S = 0.2  # of a speed on a course
 
 COURSE_TIMEOUT_S = 3.0  # without coming nearer to the end of a course
+MAYBE = "is it blocked, or is a speed limit in force?"
 
 # What counts as nearer: this fraction of the rest, or on a long way this many m or rad.
 NEARER, MOST_NEARER = 0.01, 0.01
@@ -227,9 +228,10 @@ def _course(begin: Callable[[Odometry], Course]) -> Steps:
                 if driver.ride.begun is None or left < nearest - min(NEARER * nearest, MOST_NEARER):
                     nearest, nearer = left, now
                 elif now - nearer > COURSE_TIMEOUT_S:
+                    state = driver.watch.state
                     raise NotDrivenError(
                         f"the robot came no nearer for {COURSE_TIMEOUT_S:g} s, and "
-                        f"{course.left_text} is left: is it blocked, or is a speed limit in force?"
+                        f"{course.left_text} is left: {(state and state.wheel_fault) or MAYBE}"
                     )
                 yield min(COURSE_PERIOD_S, driver.ride.period)
                 if (newest := odometer.newest()) is not None:

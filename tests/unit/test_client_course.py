@@ -132,9 +132,11 @@ def test_a_move_of_a_robot_that_waits_for_its_board_ends_with_that_reason() -> N
     assert world.sent == []
 
 
-def test_a_move_of_a_robot_that_does_not_move_ends_after_three_seconds() -> None:
-    world = WithOdometry(60.0)
-    with pytest.raises(NotDrivenError, match=r"no nearer for 3 s, and 1\.000 m is left"):
+@each("fault", ["", "left wheel is blocked"])
+def test_a_move_of_a_robot_that_does_not_move_ends_and_names_a_wheel_fault(fault: str) -> None:
+    world = WithOdometry(60.0, lambda *args: replace(followed(*args), wheel_fault=fault))
+    cause = fault or "is it blocked"
+    with pytest.raises(NotDrivenError, match=rf"no nearer for 3 s, and 1\.000 m is left: {cause}"):
         world.move()
     assert 3.0 < world.passed < 4.0
 
