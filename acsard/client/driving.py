@@ -110,6 +110,11 @@ class Driver:
         state = self.watch.state
         return 0 if state is None else state.counters.get(POSES_SET, 0)
 
+    def require_pose(self, poses_set: int | None) -> None:
+        """Raise `NotDrivenError` if the pose was set since `poses_set` had this value."""
+        if self.poses_set != poses_set:
+            raise NotDrivenError(POSE_SET if self.poses_set > (poses_set or 0) else STARTED)
+
     def require(self) -> None:
         """Raise an error if the ride has ended, or if the daemon is silent.
 
@@ -222,8 +227,7 @@ def _course(begin: Callable[[Odometry], Course]) -> Steps:
                 fresh = now - odometer.received < MAX_ODOM_AGE_S
                 driver.step(course.twist if fresh else None)
                 driver.require()
-                if driver.poses_set != sets:
-                    raise NotDrivenError(POSE_SET if driver.poses_set > (sets or 0) else STARTED)
+                driver.require_pose(sets)
                 left = abs(course.left)
                 if driver.ride.begun is None or left < nearest - min(NEARER * nearest, MOST_NEARER):
                     nearest, nearer = left, now
@@ -237,8 +241,7 @@ def _course(begin: Callable[[Odometry], Course]) -> Steps:
                 if (newest := odometer.newest()) is not None:
                     course.odom(newest)
         yield from driver.stop()
-        if driver.poses_set != sets:
-            raise NotDrivenError(POSE_SET if driver.poses_set > (sets or 0) else STARTED)
+        driver.require_pose(sets)
 
     return steps
 

@@ -77,6 +77,8 @@ class Clock:
         """Times and delays of all commands since the first one below the least, if all are."""
         self._confirmed_ns = math.inf
         """The lowest value that such commands may have given to the robot's least delay."""
+        self._reached_ns = math.inf
+        """The same by small steps down, as when a queue drains: none of them is doubtful."""
         self.known: Clock | None = None
         """The same clock if the robot has not forgotten it for others."""
         self.refused = False
@@ -100,10 +102,13 @@ class Clock:
         rises_ns = min(passed_ns * RISES, timeout_ns * (1 + passed_ns // HOUR_NS))
         if delay_ns >= least_ns - LOWER_NS:
             self._lower.clear()
+            self._reached_ns = delay_ns
             if delay_ns < least_ns + rises_ns:
                 self.least = at_ns, delay_ns
             return bool(delay_ns <= least_ns + rises_ns + timeout_ns + MARGIN_NS)
         self._lower.append((at_ns, delay_ns))
+        if self._reached_ns - SURELY_LOWER_NS <= delay_ns < self._reached_ns:
+            self._reached_ns = delay_ns
         confirms_ns = at_ns - self._lower[0][0]
         if confirms_ns > timeout_ns - MARGIN_NS:
             self._confirmed_ns = min(self._confirmed_ns, *(delay for _, delay in self._lower))
@@ -123,7 +128,8 @@ class Clock:
                 self._lower.clear()
             else:
                 del self._lower[0]
-        return delay_ns >= min(least_ns, self._confirmed_ns) - SURELY_LOWER_NS
+        lowest_ns = min(least_ns, self._confirmed_ns, self._reached_ns)
+        return delay_ns >= lowest_ns - SURELY_LOWER_NS
 
 
 class Ages:

@@ -222,9 +222,8 @@ class Arbiter(Struct):
     def notice(self, source: str, sender: str, arrived_ns: Ns) -> None:
         """Record that a message of a sender was lost or unusable; it may have been a speed.
 
-        It cancels the zero of its own identity only. Of another identity of the same program it
-        shows no more than silence, which arms after the neutral pause, and a program that sends
-        only such messages must not keep the others of the source from being armed.
+        It cancels the zero of its own identity only: a program that sends only such messages must
+        not keep the others of the source from being armed.
         """
         self.until_ns = 0
         known_source = self.sources.get(source)
