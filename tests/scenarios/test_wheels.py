@@ -20,11 +20,12 @@ from acsard.core.config.settings import (
     SimConfig,
     WheelMap,
 )
-from acsard.core.motion.sides import FAULT_RESPONSES
+from acsard.core.motion.obedience import DEAD_TIME_S
 from acsard.core.motion.wheels import (
     BLOCK_S,
     FAULT_ANGLE,
     FAULT_COUNTS,
+    TIMING_S,
     count_angle,
 )
 from acsard.core.simulator.protocol import speeds_text
@@ -202,9 +203,9 @@ def test_a_robot_that_does_not_obey_a_stop_is_a_fault_as_soon_as_it_is_evident(
     """Hands push the robot on at its speed during a stop. The daemon latches a fault.
 
     To the daemon this looks like motors that do not obey. It is evident after the ramp of the stop
-    (and the timeout of the silent source), when the wheels rolled on without an approach for three
-    response times and for 1 rad and 3 counts. The law looks at whole blocks: by their phase, it
-    took up to 4 of them longer, with four wheels as with two.
+    (and the timeout of the silent source), the longest dead time and the response time, when the
+    wheels rolled on for 1 rad, 3 counts and 0.2 s. The law looks at whole steps: by their phase, it
+    takes up to 4 of them longer.
     """
     config = world.config
     slowing = {"stop": config.limits.linear_stop_deceleration}
@@ -213,7 +214,8 @@ def test_a_robot_that_does_not_obey_a_stop_is_a_fault_as_soon_as_it_is_evident(
         ramp += next(s.timeout for s in config.commands.sources if s.name == "app")
     rolling = max(FAULT_ANGLE, FAULT_COUNTS * count_angle(config.mcu.encoder_counts))
     rolls = rolling * config.drive.wheel_radius / abs(linear)
-    within = ramp + max(FAULT_RESPONSES * config.feedback.response_time, rolls) + 4 * BLOCK_S
+    lags = 1.3 * config.feedback.response_time
+    within = ramp + DEAD_TIME_S + lags + rolls + TIMING_S + 4 * BLOCK_S
     world.drive(linear, seconds=2.0)
     began_ns = world.now_ns
     with world.mcu.fault("pushed", linear):

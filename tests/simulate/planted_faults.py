@@ -73,12 +73,12 @@ LOOP, PUBLICATION = "daemon/control_loop.py", "daemon/publication.py"
 CODEC, SESSION = "core/link/codec.py", "core/link/session.py"
 (
     AGES, ARBITER, BATTERY, BUMPERS, EMERGENCY_STOP, GYRO, KINEMATICS, LATCHES, LIFECYCLE, LIMITS,
-    MODES, NEUTRAL, ODOMETRY, UNCERTAINTY, WHEELS_LAW,
+    MODES, NEUTRAL, OBEDIENCE, ODOMETRY, UNCERTAINTY, WHEELS_LAW,
 ) = (
     f"core/motion/{name}.py"
     for name in (
         "ages", "arbiter", "battery", "bumpers", "emergency_stop", "gyro", "kinematics", "latches",
-        "lifecycle", "limits", "modes", "neutral", "odometry", "uncertainty", "wheels",
+        "lifecycle", "limits", "modes", "neutral", "obedience", "odometry", "uncertainty", "wheels",
     )
 )  # fmt: skip
 
@@ -360,14 +360,13 @@ FAULTS = (
           '"up": Reason("link_up", ""),'),
     # sanity
     fault("wheel runaway", "a wheel that rolls on after a stop is never a fault", WHEELS_LAW,
-          "if beyond >= max(FAULT_ANGLE, FAULT_COUNTS * count):", "if False:"),
+          "if wheel.obedience.unexplained >= least + wheel.timing:", "if False:"),
     fault("wheel fast", "a robot that is faster than its limiter is never a fault", WHEELS_LAW,
-          "if wheel.fast_s >= TOO_FAST_S and", "if False and"),
+          "fast = wheel.fast_s >= TOO_FAST_S and", "fast = False and"),
     fault("wheel blocked", "a wheel that does not turn is not reported", WHEELS_LAW,
-          "elif off * command < 0.0 and abs(speed) < AGREEMENT * abs(command) and not self.none_s:",
-          "elif False:"),
+          "slow, beyond = min(obedience.slow),", "slow, beyond = 0.0,"),
     fault("wheel reversed", "a wheel that turns the wrong way is never a fault", WHEELS_LAW,
-          "elif goes_on and abs(speed) >= AGREEMENT * abs(command):", "elif False:"),
+          'self._latch("wheel_reversed", i, command)', "pass"),
     # bus
     fault("bus reasons", "a message that is too big is counted as one that cannot be read",
           COMMANDS, '"too_big", f"{len(arrival.payload)} bytes are too many for a command"',
@@ -433,10 +432,8 @@ FAULTS = (
           Edit("core/link/link_state.py", "CHECKED_LINES = 3, 1", "CHECKED_LINES = 3, 2")),
     fault("wheel stuck", "a wheel that seems not to turn is neither left out nor named",
           "core/motion/sides.py", "OUT_BLOCKS = 2\n", "OUT_BLOCKS = 1_000_000\n",
-          Edit(WHEELS_LAW, 'self._warn(i, wheel, "wheel_blocked")', "pass"),
-          Edit(WHEELS_LAW,
-          'self._warn(i, wheel, wheel.warning or ("wheel_fast" if fast else "wheel_slow"))',
-          "pass")),
+          Edit(WHEELS_LAW, "slow, beyond = min(obedience.slow), min(obedience.fast)",
+          "slow = beyond = 0.0")),
     fault("counts wrong", "counts that contradict the speeds of their lines are believed",
           "core/link/board_counts.py", "MAX_DIFFERENCE = 0.2 ", "MAX_DIFFERENCE = 20.0 "),
     fault("gyro hangs", "a gyro that repeats one rate is believed", GYRO,
@@ -565,8 +562,9 @@ CASES = (
           "for cause in causes]")),
     fault("case 8", "one plain clear releases a fault and the stop below it", LIFECYCLE,
           'self.latches.of("fault") or causes]', "causes]"),
-    fault("case 9", "healthy motors that lag latch the fault `runaway`", WHEELS_LAW,
-          "elif approaches:", "elif False:"),
+    fault("case 9", "healthy motors that lag latch the fault `runaway`", OBEDIENCE,
+          "return min(self.astray)", "return self.astray[0]",
+          Edit("core/motion/sides.py", "self.due.add(told, half, whole)", "self.due.add(told)")),
     fault("case 10", "`state` keeps the last speed when the link is gone",
           "core/summary.py", "silent = odometry.pose, session.silent(now_ns)",
           "silent = odometry.pose, False"),

@@ -1,21 +1,31 @@
 """Simulated robots of any size that drive at random, and report what their encoders count.
 
 The product's limiter and kinematics give the commands. Each motor follows its own with a
-first-order lag. The seed determines everything that a robot does.
+first-order lag, some behind a dead time, and some coast. The seed determines all that a robot does.
 """
 
 from __future__ import annotations
 
 import math
 import random
+from collections import deque
 from typing import Literal
 
 from msgspec import Struct
+from msgspec.structs import replace
 
 from acsard.core.config.settings import DriveConfig, FeedbackConfig, LimitsConfig, WheelMap
 from acsard.core.motion.kinematics import Kinematics
 from acsard.core.motion.limits import follow
-from acsard.core.motion.wheels import Wheels, count_angle, new_wheels
+from acsard.core.motion.obedience import DEAD_TIME_S
+from acsard.core.motion.wheels import (
+    FAULT_ANGLE,
+    FAULT_COUNTS,
+    TIMING_S,
+    Wheels,
+    count_angle,
+    new_wheels,
+)
 from acsard.core.values import WHEELS, Motion, Twist, Wheels4, WheelSpeeds
 from tests.wheels import FOUR
 
@@ -37,6 +47,14 @@ RIGHT: dict[Kind, set[str]] = {
     "swapped": {"wheels_swapped"},
     "too fast": {"wheel_too_fast", "wheel_runaway", "wheel_fast"},
     "too slow": {"wheel_slow", "wheel_blocked"},
+}  # fmt: skip
+
+
+# Of the evidence for a fault, and of the way in the time by which a motion may be later than a
+# delay: what the wheels roll at most until a fault is found.
+ANGLES: dict[Kind, float] = {
+    "reversed": 1.2, "stuck": 1.2, "swapped": 2.6, "too fast": 1.6, "runaway": 2.6, "dead": 2.6,
+    "too slow": 4.0,
 }  # fmt: skip
 
 
@@ -117,13 +135,23 @@ class Bench:
         self.slips: dict[int, float] = {}  # factor of the motion of a wheel
         self.said = Findings()
         self.cap = math.inf
+        self.late: deque[list[float]] = deque()  # commands that the motors do not see yet
+        self.coasts = 1.0  # how much slower motors slow down than they speed up
+        self.linked = True
+        self.excess = 0.0  # m that the motors which keep their speed rolled beyond their command
 
     def step(self, wished: Twist) -> None:
         dt = 1.0 / self.robot.rate
         self.now += dt
-        self.motion = follow(self.motion, wished, dt, self.limits, self.kinematics, self.cap)
+        self.motion = (
+            follow(self.motion, wished, dt, self.limits, self.kinematics, self.cap)
+            if self.linked
+            else Motion()
+        )
         commanded = self.kinematics.wheel_speeds(self.motion.twist)
-        goals = list(commanded.as_tuple()[: self.driven])
+        told = list(commanded.as_tuple()[: self.driven])
+        self.late.append(list(told))
+        goals = self.late.popleft()
         for i, j in self.swaps:
             goals[i], goals[j] = goals[j], goals[i]
         turned, speeds = [0.0] * self.driven, [0.0] * self.driven
@@ -132,17 +160,23 @@ class Bench:
             if self.hand is not None:
                 goal, lag = self.hand[i], 0.1
             before = self.speeds[i]
+            if self.hand is None and abs(goal) < abs(before) and goal * before >= 0.0:
+                lag *= self.coasts
             goal *= self.dice.uniform(0.98, 1.02) if self.rough else 1.0
             speed = before if i in self.keeps else goal + (before - goal) * math.exp(-dt / lag)
             self.speeds[i] = speed
             moved = (before + speed) / 2 * dt * self.slips.get(i, 1.0)
             moved *= self.dice.uniform(0.95, 1.05) if self.rough else 1.0
             self.angles[i] += moved
+            if i in self.keeps:
+                self.excess += (moved - told[i] * dt) * self.robot.radius / len(self.keeps)
             counted = math.floor(self.angles[i] / self.unit)
             counts, self.counted[i] = counted - self.counted[i], counted
             counts = 0 if i in self.dead else counts * self.signs.get(i, 1)
             speeds[i] = self.frozen.get(i, round(counts * self.unit / dt, 2))
             turned[i] = speeds[i] * dt
+        if not self.linked:
+            return
         reported = WheelSpeeds(*of_four(speeds))
         wheels, said = self.wheels, self.said
         wheels.commanded = commanded
@@ -227,6 +261,79 @@ def restless(seed: int, seconds: float, wheels: WheelMap) -> tuple[Robot, Findin
     return made, bench.said
 
 
+def overdue(seed: int, seconds: float, wheels: WheelMap) -> tuple[Robot, Findings]:
+    """Drive a sound robot with a dead time, or one that coasts, that the configuration ignores."""
+    dice = random.Random(f"overdue {seed}")
+    made = robot(dice)
+    dead, coasts = (dice.uniform(0.05, 0.6), 1.0) if seed % 2 else (0.0, dice.uniform(1.5, 6.0))
+    if dead and made.lag > 0.3:
+        made = replace(made, lag=dice.uniform(0.05, 0.25), response_time=0.2)
+    bench = Bench(made, dice, wheels=wheels)
+    bench.late.extend([[0.0] * bench.driven] * round(dead * made.rate))
+    bench.coasts = min(coasts, max(1.0, max(1.2, 2.0 * made.response_time) / made.lag))
+    bench.limits = brisk(bench.limits, dice.choice((1.0, 1.0, 3.0)))
+    while bench.now < seconds:
+        one, other = twist(dice, made), twist(dice, made)
+        if dice.random() < 0.5:
+            other = Twist(one.linear * dice.uniform(-1, 1), one.angular * dice.uniform(-1, 1))
+        each = dice.choice((dice.uniform(0.1, 2.5), dice.uniform(0.2, 5.0)))
+        until, slope = bench.now + dice.uniform(2.0, 20.0), dice.uniform(0.75, 1.15)
+        bench.cap = made.speed * dice.uniform(0.2, 1.0) if dice.random() < 0.2 else math.inf
+        while bench.now < until:
+            bench.gain = slope * (dice.uniform(0.6, 1.1) if dice.random() < 0.1 else 1.0)
+            bench.hold(one, each * dice.uniform(0.5, 1.5))
+            bench.hold(other, each * dice.uniform(0.5, 1.5))
+    return made, bench.said
+
+
+def brisk(limits: LimitsConfig, acceleration: float) -> LimitsConfig:
+    a = acceleration
+    return replace(
+        limits, linear_acceleration=a, linear_deceleration=a, angular_acceleration=4 * a,
+        angular_deceleration=4 * a, linear_stop_deceleration=3.0, angular_stop_deceleration=12.0,
+    )  # fmt: skip
+
+
+FLICKER_S, FLICKERS_S = 0.13, 0.4  # the link is lost for so long, and so often
+
+
+def to_and_fro(seed: int, wheels: WheelMap, flickers: bool) -> tuple[Robot, Bench]:
+    """Motors keep one speed while the stick moves between two wishes, for a minute or 8 m.
+
+    The mean of the wishes differs from that speed by a fifth or more.
+    """
+    dice = random.Random(f"to and fro {seed}")
+    speed = dice.uniform(0.2, 1.0)
+    made = replace(robot(dice, sound=False), speed=speed)
+    bench = Bench(made, dice, wheels=wheels)
+    bench.limits = brisk(bench.limits, dice.choice((1.0, 1.0, 3.0)))
+    one = other = (0.0, 0.0)
+    mean = speed
+    while abs(speed - mean) < 0.2 * speed:
+        pair = dice.choice(
+            ((1.0, 0.0), (1.0, -1.0), (1.0, 0.4), (1.0, -0.5), (0.6, -0.2), (dice.random(), -1.0))
+        )
+        top = dice.uniform(0.5, 1.3) * speed
+        times = [math.exp(dice.uniform(math.log(0.2), math.log(3.0))) for _ in pair]
+        one, other = (top * pair[0], times[0]), (top * pair[1], times[1])
+        mean = (one[0] * one[1] + other[0] * other[1]) / sum(times)
+    bench.hold(Twist(), 1.0)
+    bench.hold(Twist(speed), 3.0 + speed)
+    groups = GROUPS[bench.driven]
+    bench.keeps, bench.said = set(groups[seed % len(groups)]), Findings()
+    began = bench.now
+    while not bench.said.faults and bench.now < began + 60.0 and abs(bench.excess) < 8.0:
+        for wish, seconds in (one, other):
+            until = bench.now + seconds
+            while bench.now < until and not bench.said.faults:
+                linked = not flickers or (bench.now - began) % FLICKERS_S >= FLICKER_S
+                if bench.linked and not linked:
+                    bench.wheels.pause()
+                bench.linked = linked
+                bench.step(Twist(wish))
+    return made, bench
+
+
 class Case(Struct, frozen=True):
     robot: Robot
     kind: Kind
@@ -284,13 +391,10 @@ def faulty(kind: Kind, seed: int, wheels: WheelMap) -> Case:
     bench.said = Findings()
     start, right = bench.now, RIGHT[kind]
     ramp = _ramp(bench, wished)
-    patience = 2.0 if kind in FACTORS else 3.0 * made.response_time
+    patience = 2.0 if kind in FACTORS else max(DEAD_TIME_S, 3.0 * made.response_time)
     bench.hold(wished, ramp + patience)
-    limit = (
-        (3.0 * max(bench.unit, bench.count))
-        if kind in FACTORS
-        else max(1.0, 3.0 * max(bench.unit, bench.count))
-    )
+    limit = max(FAULT_ANGLE, FAULT_COUNTS * max(bench.unit, bench.count))
+    limit = ANGLES[kind] * (limit + TIMING_S * abs(speed) / made.radius)
     commanded = bench.kinematics.wheel_speeds(bench.motion.twist).as_tuple()
     began, needs = bench.now, 0.0
     found = ""

@@ -10,15 +10,12 @@ from __future__ import annotations
 import math
 from typing import Literal, NamedTuple
 
-from msgspec import Struct
+from msgspec import Struct, field
 
+from acsard.core.motion.obedience import AGREEMENT, Expected
 from acsard.core.values import WHEELS, Event, Rad, RadPerS, Seconds, Wheels4
 
 SideName = Literal["left", "right"]
-
-AGREEMENT = 0.3  # fraction of the larger of two speeds
-
-FAULT_RESPONSES = 3.0  # response times without an approach
 
 # The wheels contradict each other if their sums differ by more than this fraction, counts and rad.
 # They slip if they also differ by more than a motor that reacts later (s) explains. The time
@@ -51,8 +48,6 @@ class Block(NamedTuple):
     line: Wheels4  # the angles of the last line
     speeds: Wheels4  # in it
     unit: Rad  # of an encoder count
-    limit: Rad  # evidence of a fault
-    patience: Seconds  # without an approach
     rest: Seconds  # without motion or a command, after which a wheel rests
 
 
@@ -61,10 +56,13 @@ class Side(Struct):
     front: int  # its wheels, by `WHEELS`; equal if it has only one
     rear: int
     command: RadPerS = 0.0
-    expected: RadPerS = 0.0
-    peak: RadPerS = 0.0  # of the commands in the last three response times, at least
-    next_peak: RadPerS = 0.0
-    peak_s: Seconds = 0.0  # since `peak` began
+    expected: RadPerS = 0.0  # behind the whole response time
+    halfway: RadPerS = 0.0  # behind half of it
+    due: Expected = field(default_factory=Expected)
+    told: Rad = 0.0  # commanded since the last step, and the same behind the lags
+    told_whole: Rad = 0.0
+    told_half: Rad = 0.0
+    smooth: tuple[RadPerS, RadPerS, RadPerS] = (0.0, 0.0, 0.0)  # the mean speeds of these
     difference: Rad = 0.0  # recent sum of front minus rear
     rolled: Rad = 0.0  # recent sum of the magnitudes
     net: Rad = 0.0  # recent sum of the mean
@@ -82,21 +80,36 @@ class Side(Struct):
     slip_s: Seconds = 0.0  # until the slip counts as ended
     slipped_s: Seconds = 0.0
 
-    def expect(self, command: RadPerS, s: Seconds, lag: Seconds) -> Rad:
-        """Return the angle that a wheel which follows the command behind a lag rolls in a block."""
+    @property
+    def wheels(self) -> tuple[int, ...]:
+        return (self.front,) if self.front == self.rear else (self.front, self.rear)
+
+    def expect(self, command: RadPerS, s: Seconds, lag: Seconds) -> None:
+        """Add what a wheel that follows the command behind a lag rolls in a block."""
         # Exact for a command that is constant in the block; the mean of two is, in a ramp.
         goal, self.command = (self.command + command) / 2, command
-        before, rest = self.expected - goal, math.exp(-s / lag)
-        self.expected = goal + before * rest
-        size = command if command > 0.0 else -command
-        self.peak_s += s
-        if self.peak_s >= FAULT_RESPONSES * lag:
-            self.peak, self.next_peak, self.peak_s = self.next_peak, size, 0.0
-        if size > self.next_peak:
-            self.next_peak = size
-        if size > self.peak:
-            self.peak = size
-        return goal * s + before * lag * (1.0 - rest)
+        self.told += goal * s
+        self.expected, angle = _lagged(self.expected, goal, s, lag)
+        self.told_whole += angle
+        self.halfway, angle = _lagged(self.halfway, goal, s, lag / 2)
+        self.told_half += angle
+
+    def remember(self, s: Seconds, share: float) -> None:
+        """End a step of `s` seconds, and smooth its speeds as the measured ones are."""
+        told, half, whole = self.smooth
+        told += (self.told - told * s) * share
+        half += (self.told_half - half * s) * share
+        whole += (self.told_whole - whole * s) * share
+        self.smooth = told, half, whole
+        self.due.add(told, half, whole)
+        self.told = self.told_half = self.told_whole = 0.0
+
+    def begin(self, speed: RadPerS) -> None:
+        """Expect that a wheel of this speed slows down."""
+        self.expected = self.halfway = speed
+
+    def forget(self) -> None:
+        self.due, self.smooth = Expected(), (0.0, 0.0, 0.0)
 
     def agrees(self, front: Rad, rear: Rad, keep: float, count: Rad) -> bool:
         """Add the angles of a block to the sums, and return whether they agree."""
@@ -216,3 +229,9 @@ class Side(Struct):
         if one * other < 0.0 and abs(one + other) <= AGREEMENT * larger + OUT_COUNTS * count:
             return "against", -1
         return ("still" if min(abs(one), abs(other)) <= 0.1 * larger else ""), -1
+
+
+def _lagged(speed: RadPerS, goal: RadPerS, s: Seconds, lag: Seconds) -> tuple[RadPerS, Rad]:
+    # The speed behind a lag at the end of a block, and the angle in it.
+    before, rest = speed - goal, math.exp(-s / lag)
+    return goal + before * rest, goal * s + before * lag * (1.0 - rest)

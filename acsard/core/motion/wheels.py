@@ -1,10 +1,10 @@
 """Decides whether each wheel obeys its command.
 
-The expected speed is the command behind a lag of `feedback.response_time`. Measured minus expected
-is summed to an angle (`Wheel.off`), which leaks only while both agree. Beyond 1 rad and 3 counts, a
-wheel that came no nearer to its command for three response times does not obey it: a fault if it
-rolls on, too far or the wrong way, else a warning. `sides.py` compares the two wheels of a side. A
-line only adds its angles: all else runs on the sums of `BLOCK_S`.
+`obedience.py` sums the motion of a wheel that no delay of its motor explains. Beyond 1 rad, 3
+counts and `TIMING_S` of its speed, a wheel that rolls on, too far or the wrong way does not obey: a
+fault. A wheel that rolls too little, or 30 % too fast, is a warning. `sides.py` compares the two
+wheels of a side. A line only adds its angles: the sides are compared after `BLOCK_S`, and the
+verdicts come after steps of at least that time.
 
 If two wheels are driven, nothing is compared on a side: a faulty encoder shows only by the command
 and by a gyro.
@@ -14,15 +14,22 @@ from __future__ import annotations
 
 import math
 
-from msgspec import Struct
+from msgspec import Struct, field
 
 from acsard.core.codes import Code, Reason, joined, reason
 from acsard.core.config.settings import FeedbackConfig
 from acsard.core.motion.gaps import times
 from acsard.core.motion.kinematics import Kinematics
-from acsard.core.motion.sides import (
+from acsard.core.motion.obedience import (
     AGREEMENT,
-    FAULT_RESPONSES,
+    DEAD_TIME_S,
+    DELAYS,
+    NOISE_COUNTS,
+    REACTION,
+    Bounds,
+    Obedience,
+)
+from acsard.core.motion.sides import (
     OUT_ANGLE,
     OUT_COUNTS,
     PARTNER_S,
@@ -49,12 +56,9 @@ BLOCK_S = 0.05
 MAX_BLOCK_S = 0.1  # the longest time for which one line is evidence: it may cover a stall
 
 FAULT_ANGLE, FAULT_COUNTS = 1.0, 3.0  # rad and counts, both of them
-IDLE = 0.06  # counts per second of a smoothed speed that may be the rest of one count
-LEAK_S = 2.0
-# Largest fractions of the evidence for a fault that are kept: while both agree, and at all, because
-# more would only delay the opposite one.
-AGREED, MOST = 0.3, 1.2
-APPROACH = 0.15  # fraction of the distance to the command that counts as coming nearer
+# Beyond these, of the largest speed: by so much may the motion be earlier or later than a delay.
+TIMING_S = 0.2
+AGREED_NOISE = 0.1  # of the noise of a smoothed speed: it may be the rest of one count
 
 # The smoothed speed covers this many counts, within the longest time: a coarse encoder reports no
 # motion in most lines.
@@ -66,7 +70,6 @@ LEAST_SPEED = 0.05  # m/s, of a runaway that must not look like rest
 # Times the largest output of the limiter, and rad and counts rolled beyond that, both of them: a
 # sound wheel shows up to a count more than it turned.
 TOO_FAST, TOO_FAST_S, TOO_FAST_ANGLE, TOO_FAST_COUNTS = 1.2, 1.0, 0.3, 1.5
-PACE_S = 1.5  # faster or slower by `AGREEMENT`, until this is a warning: 2 s with the smoothing
 ROUNDING = 0.006  # rad/s, of a reported speed
 JITTER_S = 0.004  # of the times of lines
 
@@ -92,22 +95,18 @@ class Wheel(Struct):
     command: RadPerS = 0.0
     speed: RadPerS = 0.0  # smoothed
     expected: RadPerS = 0.0  # smoothed alike
-    off: Rad = 0.0  # the sum of measured minus expected
+    turned: Rad = 0.0  # since the last step
     agrees: bool = True
-    approaches: bool = False  # in the last block
-    away_s: Seconds = 0.0  # since it came nearer to its command
-    away_angle: Rad = 0.0  # that it rolled since then, beyond its command
-    speed_then: RadPerS = 0.0  # when it did
-    command_then: RadPerS = 0.0
-    reacts: bool = False  # it came nearer since the command last moved away from it
+    obedience: Obedience = field(default_factory=Obedience)
+    rolled: Rad = 0.0  # either way, while it is faster or slower than expected
+    told: Rad = 0.0  # what was due meanwhile
+    timing: Rad = 0.0  # by which a sound wheel may be earlier or later than expected
     missed: Rad = 0.0  # expected minus measured since both agreed
     rested: bool = True  # and was not commanded since then
     rest_s: Seconds = 0.0
     rest_angle: Rad = 0.0
-    fast_s: Seconds = 0.0  # too fast, less the time for which it was not
-    fast_angle: Rad = 0.0  # rolled beyond what the limiter allows
-    pace_s: Seconds = 0.0
-    pace_angle: Rad = 0.0
+    fast_s: Seconds = 0.0  # faster than the limiter allows
+    fast_angle: Rad = 0.0  # rolled beyond that
     doubted: bool = False  # by a latched fault, until it is cleared: the pose may have all of it
     reported: RadPerS = 0.0  # in the last line
     same_s: Seconds = 0.0  # for which it repeats this speed
@@ -127,6 +126,7 @@ class Wheels(Struct):
     turn: Rad = 0.0  # of the block by a gyro
     by_gyro: bool = True  # it is known
     seconds: Seconds = 0.0
+    step_s: Seconds = 0.0  # since the last step
     lines: int = 0
     max_difference: Rad = 0.0  # of front and rear in one block, beyond which it ends early
     unreported_s: Seconds = REPEATED_S
@@ -181,8 +181,7 @@ class Wheels(Struct):
         self._begin()
 
     def pause(self) -> None:
-        """Expect the speeds that the next lines report: there is no link."""
-        self.begins = True
+        """End the block: there is no link. What was due and what was found stays."""
         self._begin()
 
     def forget(self) -> None:
@@ -239,11 +238,11 @@ class Wheels(Struct):
     def _drop(self) -> None:
         self.begins = True
         for wheel in self.wheels:
-            wheel.off = wheel.fast_s = wheel.fast_angle = wheel.missed = 0.0
-            wheel.away_s = wheel.away_angle = 0.0
-        self.all_turned, self.none_s = False, 0.0
+            wheel.speed, wheel.obedience = 0.0, Obedience()
+            wheel.fast_s = wheel.fast_angle = wheel.missed = 0.0
         for side in self.sides:
-            side.peak = side.next_peak = 0.0
+            side.forget()
+        self.all_turned, self.none_s = False, 0.0
 
     def _end_block(
         self, line: Wheels4, speeds: Wheels4, lag: Seconds, kinematics: Kinematics, count: Rad
@@ -252,63 +251,111 @@ class Wheels(Struct):
         if s > MAX_BLOCK_S:
             share, s = MAX_BLOCK_S / s, MAX_BLOCK_S
             angles, line = times(angles, share), times(line, share)
-        limit, patience = max(FAULT_ANGLE, FAULT_COUNTS * count), FAULT_RESPONSES * lag
         rest = REST_S + 2 * count * kinematics.radius / LEAST_SPEED
-        block = Block(s, angles, line, speeds, count, limit, patience, rest)
+        block = Block(s, angles, line, speeds, count, rest)
         if commanded is None:
             self._drop()
             for wheel, angle in zip(self.wheels, angles, strict=False):
                 _rest(wheel, angle, block)
         else:
             left, right = self.sides
-            left_angle = left.expect(commanded.front_left, s, lag)
-            right_angle = right.expect(commanded.front_right, s, lag)
+            left.expect(commanded.front_left, s, lag)
+            right.expect(commanded.front_right, s, lag)
             if self.begins or self.late:
                 for side in self.sides:
                     speed = max(angles[side.front], angles[side.rear], key=abs) / s
-                    side.expected = speed if self.begins else _nearer(side.expected, speed)
+                    side.begin(speed if self.begins else _nearer(side.expected, speed))
                 self.begins = False
-            if not self.late:
-                self._obey(block, (left_angle, right_angle))
-                self._miss(block.unit, patience)
+                self._begin_step()
+            else:
+                self._add(block)
+                if self.step_s >= max(BLOCK_S, (max(DEAD_TIME_S, lag) - BLOCK_S / 2) / DELAYS):
+                    self._obey(count)
+                    self._begin_step()
         self._compare(block, kinematics)
 
-    def _obey(self, block: Block, expected: tuple[Rad, Rad]) -> None:
-        s, angles, _, speeds, _, limit, patience, _ = block
-        fastest = 0.0
+    def _begin_step(self) -> None:
+        self.step_s = 0.0
+        for wheel in self.wheels:
+            wheel.turned = 0.0
+        for side in self.sides:
+            side.told = side.told_half = side.told_whole = 0.0
+
+    def _add(self, block: Block) -> None:
+        s = block.s
+        self.step_s += s
         for i, wheel in enumerate(self.wheels):
-            k, angle = SIDE_OF[i], angles[i]
-            command = wheel.command = self.sides[k].command
-            still = -COMMANDED < command < COMMANDED
-            if not still:
+            angle, speed = block.angles[i], block.speeds[i]
+            command = wheel.command = self.sides[SIDE_OF[i]].command
+            wheel.turned += angle
+            if not -COMMANDED < command < COMMANDED:
                 if wheel.rested:
-                    wheel.off = wheel.missed = wheel.away_s = wheel.away_angle = 0.0
+                    wheel.obedience.forget()
+                    wheel.missed = 0.0
                 wheel.rested, wheel.rest_s, wheel.rest_angle = False, 0.0, 0.0
             elif not wheel.rested:
                 _rest(wheel, angle, block)
-            _follow(wheel, angle, expected[k], block)
-            if wheel.doubted and (more := expected[k] - angle):
-                self._doubt(i, more)
-            slack = ROUNDING * s + JITTER_S * abs(speeds[i])
-            if speeds[i] == wheel.reported != 0.0 and abs(angle - speeds[i] * s) < slack:
+            slack = ROUNDING * s + JITTER_S * abs(speed)
+            if speed == wheel.reported != 0.0 and abs(angle - speed * s) < slack:
                 wheel.same_s += s
             else:
-                wheel.same_s, wheel.reported = 0.0, speeds[i]
-            if wheel.rested and abs(wheel.off) >= limit:
-                fastest, wheel.off = max(fastest, abs(wheel.speed)), 0.0
-            if not wheel.rested:
-                self._pace(i, wheel, expected[k], block)
-                if not wheel.agrees and abs(wheel.off) >= limit and wheel.away_s >= patience:
-                    self._disobeys(i, wheel, angle, block.unit)
-            if wheel.warning and wheel.agrees and not still and wheel.pace_s == 0.0:
-                self._warn(i, wheel, None)
+                wheel.same_s, wheel.reported = 0.0, speed
         self._find_none(block)
+
+    def _obey(self, count: Rad) -> None:
+        s, fastest, least = self.step_s, 0.0, max(FAULT_ANGLE, FAULT_COUNTS * count)
+        for side in self.sides:
+            size = max(abs(side.told) / s, *[abs(self.wheels[i].speed) for i in side.wheels])
+            smoothed = SMOOTHED_S
+            if size * SMOOTHED_S > SMOOTHED_COUNTS * count:
+                smoothed = SMOOTHED_COUNTS * count / size
+            share = 1.0 / (smoothed + s)
+            whole = side.told_whole
+            side.remember(s, share)
+            noise = NOISE_COUNTS * count * share
+            bounds = side.due.bounds(noise)
+            for i in side.wheels:
+                self._follow(i, whole, share, noise, bounds, least)
+        for i, wheel in enumerate(self.wheels):
+            if not wheel.rested:
+                self._pace(i, wheel, count)
+                if wheel.obedience.unexplained >= least + wheel.timing:
+                    self._disobeys(i, wheel)
+            elif wheel.obedience.unexplained >= least:
+                fastest = max(fastest, abs(wheel.speed))
+                wheel.obedience.forget()
+        for side in self.sides:
+            self._miss(side, count)
         self.unreported_s += s
         if fastest and self.unreported_s >= REPEATED_S:
             self.unreported_s = 0.0
             self.pushed = (
                 f"wheels turn at {fastest:.1f} rad/s without a command: is the robot being pushed?"
             )
+
+    def _follow(
+        self, i: int, expected: Rad, share: float, noise: RadPerS, bounds: list[Bounds], least: Rad
+    ) -> None:
+        s, wheel, side = self.step_s, self.wheels[i], self.sides[SIDE_OF[i]]
+        obedience, angle, largest = wheel.obedience, wheel.turned, side.due.most
+        speed = wheel.speed = wheel.speed + (angle - wheel.speed * s) * share
+        wheel.expected = side.smooth[-1]
+        turns = speed if speed > 0.0 else -speed
+        wheel.timing = TIMING_S * max(largest, turns)
+        # Faster than the limiter allows; a wheel that slows down may have been faster before.
+        slows = min(0.0, turns + noise - abs(obedience.speeds[-1]))
+        fast = wheel.fast_angle + (turns + REACTION * slows - TOO_FAST * largest) * s
+        if fast > 0.0 and not -COMMANDED < wheel.command < COMMANDED:
+            wheel.fast_s, wheel.fast_angle = wheel.fast_s + s, fast
+        else:
+            wheel.fast_s = wheel.fast_angle = 0.0
+        obedience.add(speed, bounds, s, least + wheel.timing)
+        more, difference = expected - angle, abs(speed - wheel.expected)
+        agrees = difference <= AGREEMENT * max(turns, abs(wheel.expected))
+        wheel.agrees = agrees or difference < AGREED_NOISE * noise
+        wheel.missed = 0.0 if wheel.agrees else wheel.missed + more
+        if wheel.doubted and more:
+            self._doubt(i, more)
 
     def _find_none(self, block: Block) -> None:
         turned, least, before = list(map(abs, block.angles)), NONE_SPEED * block.s, self.none_s
@@ -318,60 +365,49 @@ class Wheels(Struct):
         elif any(turned):
             self.slow_s, self.none_s = self.slow_s + block.s, 0.0
             self.all_turned = self.all_turned and self.slow_s <= AT_ONCE_S
-        elif not self.all_turned or min(map(abs, commands)) < NONE_SPEED:
-            self.all_turned, self.none_s = False, 0.0
-        else:
+        elif self.all_turned and min(map(abs, commands)) >= NONE_SPEED:
             self.none_s += block.s
+        elif self.none_s < NONE_S:
+            self.all_turned, self.none_s = False, 0.0
         if before < NONE_S <= self.none_s:
             left, right = commands
             figures = f"(commanded {left:.2f} and {right:.2f}, measured 0 rad/s)"
             self.fault = joined(reason("no_wheel_moves", seconds=NONE_S, figures=figures))
+            for wheel in self.wheels:
+                wheel.obedience.forget()
 
-    def _pace(self, i: int, wheel: Wheel, expected: Rad, block: Block) -> None:
-        s, angle, peak = block.s, block.angles[i], self.sides[SIDE_OF[i]].peak
-        turns, most = abs(wheel.speed), TOO_FAST * peak
-        rolled = wheel.fast_angle + angle
-        beyond = abs(rolled) - most * s
-        if beyond <= 0.0 or wheel.approaches or not peak:
-            wheel.fast_s = wheel.fast_angle = 0.0
+    def _pace(self, i: int, wheel: Wheel, count: Rad) -> None:
+        enough = max(TOO_FAST_ANGLE, TOO_FAST_COUNTS * count)
+        fast = wheel.fast_s >= TOO_FAST_S and wheel.fast_angle >= enough
+        if fast and not self._are_swapped(i):
+            self._latch("wheel_too_fast", i, self.sides[SIDE_OF[i]].due.most)
+        obedience = wheel.obedience
+        slow, beyond = min(obedience.slow), min(obedience.fast)
+        if slow or beyond:
+            wheel.rolled += abs(wheel.turned)
+            wheel.told += abs(wheel.expected) * self.step_s
         else:
-            wheel.fast_angle = math.copysign(beyond, rolled)
-            # An encoder with few counts looks slow between two of them.
-            wheel.fast_s = max(0.0, wheel.fast_s + (s if turns > most else -s))
-            enough = max(TOO_FAST_ANGLE, TOO_FAST_COUNTS * block.unit)
-            if wheel.fast_s >= TOO_FAST_S and beyond >= enough:
-                self._latch("wheel_too_fast", i, peak)
-        # Quick or slow motors differ from what is expected after a change of the command.
-        steady = abs(wheel.expected - wheel.command) < AGREEMENT * abs(wheel.command)
-        if not wheel.agrees and steady:
-            wheel.pace_s += s
-            wheel.pace_angle += angle - expected
-            if wheel.pace_s >= PACE_S and abs(wheel.pace_angle) >= block.unit:
-                fast = turns > abs(wheel.expected)
-                self._warn(i, wheel, wheel.warning or ("wheel_fast" if fast else "wheel_slow"))
-        elif wheel.pace_s:
-            wheel.pace_s -= s
-            if wheel.pace_s <= 0.0:
-                wheel.pace_s = wheel.pace_angle = 0.0
-
-    def _disobeys(self, i: int, wheel: Wheel, angle: Rad, count: Rad) -> None:
-        speed, off, command = wheel.speed, wheel.off, wheel.command
-        if self._are_swapped(i):
+            wheel.rolled = wheel.told = 0.0
+        if -COMMANDED < wheel.command < COMMANDED or self.none_s:
             return
-        goes_on = angle * off > 0.0 and speed * off > 0.0
-        beyond = abs(wheel.away_angle)
-        if goes_on and abs(command) < COMMANDED:
-            # A sound wheel comes to rest before it has rolled this far without an approach.
-            if beyond >= max(FAULT_ANGLE, FAULT_COUNTS * count):
-                self._latch("wheel_runaway", i, command)
-        elif goes_on and off * command > 0.0:
-            # A sound wheel is at its command before its smoothed speed, the mean of some counts.
-            if beyond >= count and abs(speed) > abs(command):
-                self._latch("wheel_runaway", i, command)
-        elif goes_on and abs(speed) >= AGREEMENT * abs(command):
+        if beyond >= count + wheel.timing:
+            self._warn(i, wheel, wheel.warning or "wheel_fast")
+        elif slow >= count + wheel.timing:
+            stands = abs(wheel.speed) < AGREEMENT * abs(wheel.command)
+            self._warn(i, wheel, "wheel_blocked" if stands else wheel.warning or "wheel_slow")
+        elif wheel.agrees and not slow and not beyond:
+            self._warn(i, wheel, None)
+
+    def _disobeys(self, i: int, wheel: Wheel) -> None:
+        # One cause is enough: the robot stops.
+        if wheel.doubted or self._are_swapped(i):
+            return
+        speed, command = wheel.speed, wheel.command
+        due = self.sides[SIDE_OF[i]].due.in_direction_of(speed)
+        if due < AGREEMENT * abs(speed) and COMMANDED < abs(command) < abs(speed) / AGREEMENT:
             self._latch("wheel_reversed", i, command)
-        elif off * command < 0.0 and abs(speed) < AGREEMENT * abs(command) and not self.none_s:
-            self._warn(i, wheel, "wheel_blocked")
+        else:
+            self._latch("wheel_runaway", i, command)
 
     def _are_swapped(self, i: int) -> bool:
         # Whether this wheel and the one across turn as commanded to each other.
@@ -397,6 +433,8 @@ class Wheels(Struct):
             f"measured {one.speed:.2f} and {other.speed:.2f} rad/s)"
         )
         self.fault = joined(reason("wheels_swapped", part=names, wheels=names, figures=figures))
+        for wheel in (one, other):
+            wheel.obedience.forget()
         return True
 
     def _latch(self, code: Code, i: int, command: RadPerS) -> None:
@@ -408,7 +446,8 @@ class Wheels(Struct):
             wheel.doubted = True
             self._doubt(i, wheel.missed)
         # Another fault needs new evidence: the robot stops now.
-        wheel.off = wheel.away_s = wheel.away_angle = wheel.fast_s = wheel.fast_angle = 0.0
+        wheel.obedience.forget()
+        wheel.fast_s = wheel.fast_angle = 0.0
 
     def _doubt(self, i: int, angle: Rad) -> None:
         # What a wheel with a latched fault showed otherwise than expected, which the pose has. Of
@@ -433,18 +472,17 @@ class Wheels(Struct):
             event = Event("wheel_fault", text, "warning", kind=code, code=code)
         self.events = (*self.events, event)
 
-    def _miss(self, count: Rad, patience: Seconds) -> None:
-        for side in self.sides:
-            one, other = self.wheels[side.front], self.wheels[side.rear]
-            # Quick motors stop before they are expected to.
-            still = -COMMANDED < side.command < COMMANDED
-            if side.out >= 0 or still or min(abs(one.missed), abs(other.missed)) <= count:
-                continue
-            if one.away_s >= patience and other.away_s >= patience:
-                values = [0.0] * 4
-                values[side.front], values[3 - side.front] = one.missed, other.missed
-                one.missed = other.missed = 0.0
-                self.missed = (*self.missed, (side.name, _wheels4(values)))
+    def _miss(self, side: Side, count: Rad) -> None:
+        one, other = self.wheels[side.front], self.wheels[side.rear]
+        # Quick motors stop before they are expected to.
+        still = -COMMANDED < side.command < COMMANDED
+        if side.out >= 0 or still or min(abs(one.missed), abs(other.missed)) <= count:
+            return
+        if all(w.obedience.off > count + w.timing for w in (one, other)):
+            values = [0.0] * 4
+            values[side.front], values[3 - side.front] = one.missed, other.missed
+            one.missed = other.missed = 0.0
+            self.missed = (*self.missed, (side.name, _wheels4(values)))
 
     def _compare(self, block: Block, kinematics: Kinematics) -> None:
         if len(self.wheels) < len(WHEELS):
@@ -487,54 +525,14 @@ def count_angle(counts: int) -> Rad:
     return math.tau / (counts or ASSUMED_COUNTS)
 
 
-def _follow(wheel: Wheel, angle: Rad, expected_angle: Rad, block: Block) -> None:
-    s, count, command, speed = block.s, block.unit, wheel.command, wheel.speed
-    size = command if command > 0.0 else -command
-    turns = speed if speed > 0.0 else -speed
-    most = turns if turns > size else size
-    smoothed = SMOOTHED_S
-    if most * SMOOTHED_S > SMOOTHED_COUNTS * count:
-        smoothed = SMOOTHED_COUNTS * count / most
-    share = 1.0 / (smoothed + s)
-    speed = wheel.speed = speed + (angle - speed * s) * share
-    expected = wheel.expected = wheel.expected + (expected_angle - wheel.expected * s) * share
-    turns = speed if speed > 0.0 else -speed
-    difference = abs(speed - expected)
-    off, most = wheel.off + angle - expected_angle, MOST * block.limit
-    agrees = wheel.agrees = (
-        difference <= AGREEMENT * max(turns, abs(expected)) or difference < IDLE * count
-    )
-    if agrees:
-        off -= off * s / LEAK_S
-        most = AGREED * block.limit
-        wheel.missed = 0.0
-    else:
-        wheel.missed += expected_angle - angle
-    wheel.off = most if off > most else -most if off < -most else off
-    away = speed - command
-    nearer, farther = wheel.speed_then - speed, wheel.command_then - command
-    if away < 0.0:
-        away, nearer, farther = -away, -nearer, -farther
-    approaches = wheel.approaches = nearer > APPROACH * away + 2 * count * share
-    if away <= AGREEMENT * max(turns, size) or farther > AGREEMENT * away:
-        wheel.away_s, wheel.away_angle = 0.0, 0.0
-        wheel.speed_then, wheel.command_then, wheel.reacts = speed, command, False
-    elif approaches:
-        wheel.away_s, wheel.away_angle, wheel.speed_then, wheel.reacts = 0.0, 0.0, speed, True
-    else:
-        wheel.away_s += s
-        wheel.away_angle += angle - command * s
-        if nearer < 0.0 and not wheel.reacts:
-            wheel.speed_then = speed  # the worst one counts
-
-
 def _rest(wheel: Wheel, angle: Rad, block: Block) -> None:
     wheel.rest_angle += angle
     wheel.rest_s += block.s
     if abs(wheel.rest_angle) > 1.01 * block.unit + REST_ANGLE:
         wheel.rest_s = wheel.rest_angle = 0.0
     elif wheel.rest_s >= block.rest:
-        wheel.rested, wheel.rest_s, wheel.rest_angle, wheel.off = True, 0.0, 0.0, 0.0
+        wheel.rested, wheel.rest_s, wheel.rest_angle = True, 0.0, 0.0
+        wheel.obedience.forget()
 
 
 def _nearer(one: RadPerS, other: RadPerS) -> RadPerS:
@@ -548,5 +546,5 @@ def _wheels4(values: list[float]) -> Wheels4:
 
 def _text(wheel: Wheel, name: str) -> str:
     assert wheel.warning is not None
-    share = wheel.speed / wheel.expected if wheel.expected else 0.0
+    share = wheel.rolled / wheel.told if wheel.told else 0.0
     return joined(reason(wheel.warning, wheel=name, share=f"{share:.0%}")).text
