@@ -135,7 +135,7 @@ def test_blocked_wheels_are_a_warning_until_they_turn(wheels: WheelMap) -> None:
     assert (bench.faults, bench.events) == ([], ["wheel_blocked"] * len(wheels.names))
     texts = bench.text.split("; ")
     assert [text.partition(" wheel is blocked, or has no")[0] for text in texts] == [*wheels.names]
-    bench.run(10.0, 10.0, 1.5)
+    bench.run(10.0, 10.0, 2.0)
     assert (bench.text, bench.events[len(texts) :]) == ("", ["again"] * len(texts))
 
 
