@@ -60,7 +60,7 @@ GUARD_CODES: tuple[GuardCode, ...] = get_args(GuardCode)
 # Causes of a latched fault.
 FaultCode = Literal[
     GuardCode, "driver_fault", "impossible_speeds", "wheel_reversed", "wheel_runaway",
-    "wheel_too_fast", "wheels_swapped", "no_wheel_moves",
+    "wheel_too_fast", "wheels_swapped", "no_wheel_moves", "no_wheel_begins",
 ]  # fmt: skip
 
 # Trouble of a wheel that does not stop the robot.
@@ -221,6 +221,10 @@ no_wheel_moves
     all wheels turned, and for {seconds:g} s none has shown any motion {figures}:
     -> is the robot blocked, have the encoders or the motors lost their supply, or does the board
     report no speeds any more?
+no_wheel_begins
+    no wheel has begun to move for {seconds:.1f} s {figures}:
+    -> is the robot blocked, have the motors or the encoders no supply, or is the speed too small
+    for the motors?
 wheel_blocked
     {wheel} wheel is blocked, or has no power:
     -> check cable, motor and encoder, and for the last motor of a line also the setting

@@ -433,6 +433,8 @@ class Robot:
         estimate = state.odometry.fold(line, checks, self.model)
         if wheels.fault is not None:
             self._fault(wheels.fault, now, events)
+        if wheels.gives_up:
+            state.arbiter.require_neutral(now.mono_ns)
         if wheels.pushed:
             state.count("uncommanded_motion")
             events.append(Event("uncommanded_motion", wheels.pushed, "warning"))

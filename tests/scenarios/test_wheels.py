@@ -290,13 +290,39 @@ def test_encoders_that_die_all_at_once_stop_the_robot_within_a_second_by_one_fau
 
 
 @four_and_two
-def test_motors_that_lose_their_power_slow_down_and_latch_nothing(wheels: WheelMap) -> None:
+def test_motors_that_do_not_turn_wait_for_a_zero_and_the_third_time_for_a_clear(
+    wheels: WheelMap,
+) -> None:
+    """They lose their power, slow down, and do not begin again: a kerb looks the same."""
     world = World(Config(mcu=McuConfig(wheels=wheels)))
     world.drive(0.5, seconds=2.0)
     with world.mcu.switched(partial(replace, drives=(0.0,) * len(wheels.letters))):
+        world.hold(0.5, seconds=2.0)
+        assert world.state.mode == "driving"
+        assert world.state.wheel_fault.startswith("no wheel has begun to move")
         world.hold(0.5, seconds=3.0)
-    assert world.state.mode == "driving"
-    assert "is blocked, or has no power" in world.state.wheel_fault
+        assert world.state.code == "neutral"
+    world.hold(0.5, seconds=2.0)
+    assert world.state.code == "neutral"
+    world.drive(0.5, seconds=1.0)
+    assert (world.state.code, world.state.wheel_fault) == ("commanded", "")
+    with world.mcu.switched(partial(replace, drives=(0.0,) * len(wheels.letters))):
+        for code in ("neutral", "no_wheel_begins"):
+            world.hold(0.0, seconds=0.5)
+            world.hold(0.5, seconds=5.0)
+            assert world.state.code == code
+
+
+@four_and_two
+def test_a_way_that_dead_encoders_do_not_show_is_in_the_covariance(wheels: WheelMap) -> None:
+    """It may be a robot that stands: nothing tells them apart."""
+    world = World(Config(mcu=McuConfig(wheels=wheels)))
+    with world.mcu.switched(partial(replace, gains=(0.0,) * len(wheels.letters))):
+        world.drive(0.08, seconds=20.0)
+    assert world.state.x == 0.0
+    true = world.mcu.vehicle.pose
+    assert 1.4 < true.x < 1.7
+    assert true.x < 2.3 * math.sqrt(world.odom.pose.covariance[0])
 
 
 @four_and_two

@@ -39,7 +39,7 @@ FACTORS = {"too fast": (1.6, 2.5), "too slow": (0.35, 0.55)}
 RIGHT: dict[Kind, set[str]] = {
     "reversed": {"wheel_reversed", "left out"},
     "runaway": {"wheel_runaway"},
-    "dead": {"wheel_blocked", "left out"},
+    "dead": {"wheel_blocked", "left out", "no_wheel_begins"},
     "stuck": {
         "wheel_runaway", "wheel_too_fast", "wheel_reversed", "wheel_blocked",
         "wheel_slow", "left out",

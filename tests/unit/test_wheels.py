@@ -41,7 +41,7 @@ class Bench:
         self.events: list[str] = []
         self.faults: list[str] = []
         self.missed: list[tuple[str, float]] = []  # sides that may have turned, and how far, rad
-        self.pushes = 0
+        self.pushes = self.gave_up = 0
 
     def run(
         self,
@@ -72,6 +72,7 @@ class Bench:
                 time_s = min(time_s, (number + 1) * each)
             self.events += [event.kind for event in wheels.events]
             self.pushes += bool(wheels.pushed)
+            self.gave_up += wheels.gives_up
             if wheels.fault is not None:
                 self.faults.append(wheels.fault.code)
                 if until_fault:
@@ -129,14 +130,35 @@ def test_a_robot_faster_than_its_limiter_for_a_second_is_a_fault(
 
 
 @each("wheels", MAPS)
-def test_blocked_wheels_are_a_warning_until_they_turn(wheels: WheelMap) -> None:
-    bench = Bench(wheels=wheels)
-    bench.run(0.0, 10.0, 1.5)
-    assert (bench.faults, bench.events) == ([], ["wheel_blocked"] * len(wheels.names))
+def test_the_blocked_wheels_of_a_side_are_a_warning_until_they_turn(wheels: WheelMap) -> None:
+    bench, right = Bench(wheels=wheels), [name for name in wheels.names if "right" in name]
+    bench.run(WheelSpeeds(0.0, 10.0, 10.0, 0.0), 10.0, 1.5)
+    assert (bench.faults, bench.events) == ([], ["wheel_blocked"] * len(right))
     texts = bench.text.split("; ")
-    assert [text.partition(" wheel is blocked, or has no")[0] for text in texts] == [*wheels.names]
+    assert [text.partition(" wheel is blocked, or has no")[0] for text in texts] == right
     bench.run(10.0, 10.0, 2.0)
     assert (bench.text, bench.events[len(texts) :]) == ("", ["again"] * len(texts))
+
+
+@each("wheels", MAPS)
+def test_wheels_of_which_none_begins_are_one_warning_until_one_turns(wheels: WheelMap) -> None:
+    bench = Bench(wheels=wheels)
+    bench.run(0.0, 1.0, 20.0)  # a speed that the motors may ignore
+    assert (bench.faults, bench.events, bench.gave_up) == ([], ["no_wheel_begins"], 0)
+    assert bench.text.startswith("no wheel has begun to move for ")
+    bench.run(1.0, 1.0, 2.0)
+    assert (bench.text, bench.events) == ("", ["no_wheel_begins", "again"])
+    bench = Bench(wheels=wheels)
+    for number in range(1, 3):
+        bench.run(0.0, 2.0, 3.2)
+        bench.run(0.0, 0.0, 1.0)
+        assert (bench.faults, bench.gave_up) == ([], number)
+    bench.run(0.0, 2.0, 3.2)
+    assert bench.faults == ["no_wheel_begins"]
+    for _ in range(5):  # not three times in a minute
+        bench.run(0.0, 0.0, 40.0)
+        bench.run(0.0, 2.0, 3.2)
+    assert (bench.faults, bench.gave_up) == (["no_wheel_begins"], 7)
 
 
 @each("wheels", MAPS)

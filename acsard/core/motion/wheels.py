@@ -38,6 +38,7 @@ from acsard.core.motion.sides import (
     Side,
     SideName,
 )
+from acsard.core.motion.standstill import COMMANDED, Standstill
 from acsard.core.values import (
     STILL,
     TWO_WHEELS,
@@ -73,13 +74,7 @@ TOO_FAST, TOO_FAST_S, TOO_FAST_ANGLE, TOO_FAST_COUNTS = 1.2, 1.0, 0.3, 1.5
 ROUNDING = 0.006  # rad/s, of a reported speed
 JITTER_S = 0.004  # of the times of lines
 
-COMMANDED = 0.005  # rad/s: a line to the board shows a lower one as 0.00
-
 REPEATED_S = 1.0  # between two reports of motion without a command
-
-# No wheel moves: all of them turned this fast under such a command, and at once none shows any
-# motion. Motors without power slow down.
-NONE_SPEED, AT_ONCE_S, NONE_S = 2.0, 0.1, 1.0
 
 SWAPPED_FRACTION = 0.2  # of the commands: by how much those of the sides must differ
 
@@ -130,9 +125,8 @@ class Wheels(Struct):
     lines: int = 0
     max_difference: Rad = 0.0  # of front and rear in one block, beyond which it ends early
     unreported_s: Seconds = REPEATED_S
-    all_turned: bool = False  # at `NONE_SPEED` at least, until `AT_ONCE_S` before the last motion
-    slow_s: Seconds = 0.0  # with any motion since then
-    none_s: Seconds = 0.0  # without any
+    standstill: Standstill = field(default_factory=Standstill)
+    gives_up: bool = False  # no wheel begins to move, so each sender must be neutral again
     excludes: bool = False
     slips: bool = False  # the wheels of a side contradict each other
     missed: tuple[tuple[SideName, Wheels4], ...] = ()  # by both wheels of a side
@@ -169,6 +163,7 @@ class Wheels(Struct):
         else:
             self.turn += turn
         self.events, self.fault, self.pushed, self.repair = (), None, "", NOTHING
+        self.gives_up = False
         most = self.max_difference
         if seconds < BLOCK_S and (
             self.lines == 1
@@ -229,6 +224,8 @@ class Wheels(Struct):
         texts = [side.out_text for side in out] + [side.slip_text for side in slipping]
         named = zip(self.names, self.wheels, strict=True)
         texts += [_text(wheel, name) for name, wheel in named if wheel.warning]
+        if self.standstill.why is not None:
+            texts.append(self.standstill.why.text)
         excluded, names = [WHEELS[side.out] for side in out], [side.name for side in slipping]
         return WheelsStatus("; ".join(texts), tuple(excluded), tuple(names))
 
@@ -242,7 +239,7 @@ class Wheels(Struct):
             wheel.fast_s = wheel.fast_angle = wheel.missed = 0.0
         for side in self.sides:
             side.forget()
-        self.all_turned, self.none_s = False, 0.0
+        self.standstill.forget()
 
     def _end_block(
         self, line: Wheels4, speeds: Wheels4, lag: Seconds, kinematics: Kinematics, count: Rad
@@ -358,23 +355,22 @@ class Wheels(Struct):
             self._doubt(i, more)
 
     def _find_none(self, block: Block) -> None:
-        turned, least, before = list(map(abs, block.angles)), NONE_SPEED * block.s, self.none_s
-        commands = [side.command for side in self.sides]
-        if min(turned) >= least:
-            self.all_turned, self.slow_s, self.none_s = True, 0.0, 0.0
-        elif any(turned):
-            self.slow_s, self.none_s = self.slow_s + block.s, 0.0
-            self.all_turned = self.all_turned and self.slow_s <= AT_ONCE_S
-        elif self.all_turned and min(map(abs, commands)) >= NONE_SPEED:
-            self.none_s += block.s
-        elif self.none_s < NONE_S:
-            self.all_turned, self.none_s = False, 0.0
-        if before < NONE_S <= self.none_s:
-            left, right = commands
-            figures = f"(commanded {left:.2f} and {right:.2f}, measured 0 rad/s)"
-            self.fault = joined(reason("no_wheel_moves", seconds=NONE_S, figures=figures))
+        left, right = self.sides
+        angles, commands = list(block.angles[: len(self.wheels)]), (left.command, right.command)
+        stood = self.standstill.why is not None
+        verdict = self.standstill.add(angles, commands, block.s, block.unit)
+        if verdict:
+            why = self.standstill.why
+            assert why is not None
             for wheel in self.wheels:
                 wheel.obedience.forget()
+            self.gives_up = verdict == "given up"
+            if verdict == "fault":
+                self.fault = why
+            elif verdict == "said" or self.gives_up:
+                self.events = (*self.events, _warning(why.text, why.code))
+        elif stood and self.standstill.why is None:
+            self.events = (*self.events, Event("wheel_fault", "a wheel turns again", kind="again"))
 
     def _pace(self, i: int, wheel: Wheel, count: Rad) -> None:
         enough = max(TOO_FAST_ANGLE, TOO_FAST_COUNTS * count)
@@ -382,13 +378,15 @@ class Wheels(Struct):
         if fast and not self._are_swapped(i):
             self._latch("wheel_too_fast", i, self.sides[SIDE_OF[i]].due.most)
         obedience = wheel.obedience
+        if self.standstill.why is not None:
+            obedience.forget()  # one cause for all
         slow, beyond = min(obedience.slow), min(obedience.fast)
         if slow or beyond:
             wheel.rolled += abs(wheel.turned)
             wheel.told += abs(wheel.expected) * self.step_s
         else:
             wheel.rolled = wheel.told = 0.0
-        if -COMMANDED < wheel.command < COMMANDED or self.none_s:
+        if -COMMANDED < wheel.command < COMMANDED or self.standstill.none_s:
             return
         if beyond >= count + wheel.timing:
             self._warn(i, wheel, wheel.warning or "wheel_fast")
@@ -468,8 +466,7 @@ class Wheels(Struct):
             text = f"{self.names[i]} wheel obeys its command again"
             event = Event("wheel_fault", text, kind="again")
         else:
-            text = _text(wheel, self.names[i])
-            event = Event("wheel_fault", text, "warning", kind=code, code=code)
+            event = _warning(_text(wheel, self.names[i]), code)
         self.events = (*self.events, event)
 
     def _miss(self, side: Side, count: Rad) -> None:
@@ -478,7 +475,8 @@ class Wheels(Struct):
         still = -COMMANDED < side.command < COMMANDED
         if side.out >= 0 or still or min(abs(one.missed), abs(other.missed)) <= count:
             return
-        if all(w.obedience.off > count + w.timing for w in (one, other)):
+        none = self.standstill.why is not None
+        if none or all(w.obedience.off > count + w.timing for w in (one, other)):
             values = [0.0] * 4
             values[side.front], values[3 - side.front] = one.missed, other.missed
             one.missed = other.missed = 0.0
@@ -542,6 +540,10 @@ def _nearer(one: RadPerS, other: RadPerS) -> RadPerS:
 def _wheels4(values: list[float]) -> Wheels4:
     front_right, front_left, rear_left, rear_right = values
     return front_right, front_left, rear_left, rear_right
+
+
+def _warning(text: str, code: Code) -> Event:
+    return Event("wheel_fault", text, "warning", kind=code, code=code)
 
 
 def _text(wheel: Wheel, name: str) -> str:

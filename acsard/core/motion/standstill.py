@@ -1,0 +1,96 @@
+"""Finds that no wheel moves: four equal verdicts are one, and it is not known whose fault it is.
+
+All wheels turned and at once none shows any motion: the encoders or the supply have failed, or the
+robot ran into something, which is a fault after `SUDDEN_S`. Wheels that do not begin may stand at a
+kerb, have no power, or be told a speed that their motors ignore: a warning. Commands that a motor
+obeys are given up after `BEGIN_S`, and the third time in a minute is a fault.
+"""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from msgspec import Struct
+
+from acsard.core.codes import Reason, joined, reason
+from acsard.core.values import Rad, RadPerS, Seconds
+
+# All wheels turned this fast under such a command, and at once none shows any motion. Motors
+# without power slow down. Slower commands may be too slow for the motors.
+TURNS, AT_ONCE_S, SUDDEN_S = 2.0, 0.1, 1.0
+
+SAID_S, SAID_ANGLE = 1.0, 1.0  # commanded in vain, both of them, until it is a warning
+BEGIN_S, TRIES, TRIES_S = 3.0, 3, 60.0
+
+COMMANDED = 0.005  # rad/s: a line to the board shows a lower one as 0.00
+
+Verdict = Literal["", "said", "given up", "fault"]
+
+
+class Standstill(Struct):
+    all_turned: bool = False  # at `TURNS` at least, until `AT_ONCE_S` before the last motion
+    slow_s: Seconds = 0.0  # with any motion since then
+    none_s: Seconds = 0.0  # without any, while all are commanded
+    none_angle: Rad = 0.0  # the least that was commanded meanwhile
+    fast_s: Seconds = 0.0  # of it, with commands of `TURNS` at least
+    why: Reason | None = None  # until a wheel turns
+    tries: int = 0
+    tries_s: Seconds = 0.0  # since the first of them
+
+    def forget(self) -> None:
+        self.all_turned, self.none_s, self.none_angle, self.fast_s = False, 0.0, 0.0, 0.0
+
+    def add(
+        self, angles: list[Rad], commands: tuple[RadPerS, RadPerS], s: Seconds, count: Rad
+    ) -> Verdict:
+        """Add a block: the angles of the wheels, and the commands of the left and right side."""
+        turned, command = [abs(angle) for angle in angles], min(map(abs, commands))
+        if self.tries:
+            self.tries_s += s
+            if self.tries_s > TRIES_S:
+                self.tries = 0
+        if any(turned):
+            if min(turned) >= TURNS * s:
+                self.all_turned, self.slow_s = True, 0.0
+            else:
+                self.slow_s += s
+                self.all_turned = self.all_turned and self.slow_s <= AT_ONCE_S
+            self.none_s = self.none_angle = self.fast_s = 0.0
+            self.why = None
+            return ""
+        if command < COMMANDED:
+            self.forget()
+            return ""
+        self.none_s += s
+        self.none_angle += command * s
+        before, self.fast_s = self.fast_s, self.fast_s + s if command >= TURNS else 0.0
+        if self.all_turned:
+            if not self.fast_s:
+                self.all_turned = False
+            elif before < SUDDEN_S <= self.fast_s:
+                self.why = _why("no_wheel_moves", commands, SUDDEN_S)
+                return "fault"
+            return ""
+        if before < BEGIN_S <= self.fast_s:
+            if not self.tries:
+                self.tries_s = 0.0
+            self.tries += 1
+            self.why = _why("no_wheel_begins", commands, self.none_s)
+            if self.tries < TRIES:
+                return "given up"
+            self.tries = 0
+            return "fault"
+        if self.why is None and self.none_s >= SAID_S and self.none_angle >= SAID_ANGLE + count:
+            self.why = _why("no_wheel_begins", commands, self.none_s)
+            return "said"
+        return ""
+
+
+def _why(
+    code: Literal["no_wheel_moves", "no_wheel_begins"],
+    commands: tuple[RadPerS, RadPerS],
+    seconds: Seconds,
+) -> Reason:
+    left, right = commands
+    figures = f"(commanded {left:.2f} and {right:.2f}, measured 0 rad/s)"
+    return joined(reason(code, seconds=seconds, figures=figures))
