@@ -126,10 +126,11 @@ stale
     stamps: the network delays them;
     -> if this goes on, check the network
 set_back
-    commands of {source} arrive {seconds:g} s later than its earliest ones, by their stamps: the
-    sender's clock was set back, or its commands wait in a queue;
-    -> if the clock was set, restart the sender or type `acsard call activate`; otherwise check the
-    network
+    commands of {source} arrive {seconds:g} s later than its earliest ones, by their stamps: its
+    computer's clock was slewed or set back by as much, or they wait in a queue, and stamps do not
+    show which;
+    -> did the clock change (`chronyc tracking` or `timedatectl` there)? Then restart the sender or
+    type `acsard call activate`. Otherwise look for the queue: is the network congested?
 stamps
     the stamps of {source} do not advance with time ({note});
     -> is use_sim_time on, or are the stamps copied from another message? Send the time of the

@@ -216,6 +216,22 @@ def test_the_least_delay_rises_by_at_most_one_timeout_in_any_hour() -> None:
     assert late_ms <= 250 * (1 + last_ms / hour_ms) + 1
 
 
+@each(("back_ms", "at_s"), [(200, 0), (300, 100), (400, 300), (500, 500), (510, None)])
+def test_a_clock_that_was_slewed_back_and_a_queue_of_as_much_count_at_the_same_time(
+    back_ms: int, at_s: int | None
+) -> None:
+    """Both have these arrivals and stamps, so what heals the one obeys the other."""
+    sender, late_ms, refused_s = Sender(1000), 0.0, 0.0
+    for at_ms in range(1050, 1_200_000, 50):
+        late_ms = min(back_ms, late_ms + 4.15)  # 83 ms per second, as chrony slews
+        if sender.hear(at_ms, at_ms - late_ms):
+            refused_s = at_ms / 1000
+    if at_s is None:
+        assert refused_s > 1199.9
+    else:
+        assert abs(refused_s - at_s) <= 4.0
+
+
 @each(
     ("silence_s", "late_ms", "verdict"),
     [

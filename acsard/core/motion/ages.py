@@ -3,8 +3,9 @@
 Echo: the daemon measures the age by its own clock, and the echo may be as old as the timeout of the
 source plus `MARGIN_NS`. Stamp: the clock of the sender is not synchronized, so only the rise of the
 delay (arrival minus stamp) above its least value is known. The least delay rises slowly, because
-two clocks drift, and nothing proves it upwards: a clock that was set back, or commands that wait in
-a queue, are refused until `activate` or a new sender id. A refused command changes no timeout.
+two clocks drift, and nothing proves it upwards: a clock that was slewed or set back gives the very
+stamps and arrivals of a queue. Both are refused until the least delay has risen, `activate` or a
+new sender id. A refused command changes no timeout.
 """
 
 from __future__ import annotations
@@ -95,7 +96,7 @@ class Clock(Struct):
     first_refused: tuple[Ns, Ns] | None = None  # arrival and stamp of the first refused command
     cause: AgeVerdict = ""  # of refusals that last
     advance: float = 0.0  # of the stamps, s per second, while refusals last
-    behind: int = 0  # delay above the least one
+    behind: int = 0  # delay above the least one of the last hour
 
     def judge_stamp(self, at_ns: Ns, stamp_ns: Ns, timeout_ns: Ns) -> AgeVerdict:
         still = self._stands_still(at_ns, stamp_ns, timeout_ns)
@@ -105,7 +106,7 @@ class Clock(Struct):
         if least is None or delay < least - MARGIN_NS:
             verdict = self._prove(at_ns, delay, timeout_ns)
         else:
-            self.since_ns, self.behind = None, delay - least
+            self.since_ns, self.behind = None, delay - min(self.lows, default=least)
             verdict = "stale" if delay - least > timeout_ns else ""
         self.late = self.late or (verdict == "stale" and least is not None)
         if still:
