@@ -130,7 +130,8 @@ set_back
     computer's clock was slewed or set back by as much, or they wait in a queue, and stamps do not
     show which;
     -> did the clock change (`chronyc tracking` or `timedatectl` there)? Then restart the sender or
-    type `acsard call activate`. Otherwise look for the queue: is the network congested?
+    type `acsard call activate`. Otherwise look for the queue, or for another program on this key
+    whose clock is ahead: without a `sender` they share one
 stamps
     the stamps of {source} do not advance with time ({note});
     -> is use_sim_time on, or are the stamps copied from another message? Send the time of the

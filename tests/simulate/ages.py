@@ -101,7 +101,8 @@ class Clock:
         passed_ns = at_ns - since_ns
         rises_ns = min(passed_ns * RISES, timeout_ns * (1 + passed_ns // HOUR_NS))
         if delay_ns >= least_ns - LOWER_NS:
-            self._lower.clear()
+            if delay_ns <= least_ns + rises_ns + timeout_ns + MARGIN_NS:
+                self._lower.clear()
             self._reached_ns = delay_ns
             if delay_ns < least_ns + rises_ns:
                 self.least = at_ns, delay_ns

@@ -204,6 +204,20 @@ def test_a_lower_delay_counts_when_the_commands_of_one_timeout_confirm_it() -> N
     assert sender.hear(3750, 3500) == "stale"
 
 
+@each("every_ms", [10, 50, 200])
+@each("ahead_ms", [0, 40, 280, 3000])
+def test_a_prompt_program_counts_beside_the_backlog_of_another_one_with_its_identity(
+    every_ms: int, ahead_ms: int
+) -> None:
+    sender, verdicts = Sender(1000), {}
+    for at_ms in range(9000, 12_000, 10):
+        if at_ms % every_ms == 0:  # sent from 1.05 s on
+            assert sender.hear(at_ms, 1050 + (at_ms - 9000) / every_ms * 5) != ""
+        if at_ms % 50 == 5 or at_ms % 50 == 0:
+            verdicts[at_ms] = sender.hear(at_ms + 5, at_ms + 5 + ahead_ms)
+    assert {verdict for at_ms, verdict in verdicts.items() if at_ms > 9600} == {""}
+
+
 def test_the_least_delay_rises_by_at_most_one_timeout_in_any_hour() -> None:
     sender, hour_ms = Sender(1000), 3_600_000
     obeyed: list[tuple[int, float]] = []

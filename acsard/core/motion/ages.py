@@ -106,8 +106,10 @@ class Clock(Struct):
         if least is None or delay < least - MARGIN_NS:
             verdict = self._prove(at_ns, delay, timeout_ns)
         else:
-            self.since_ns, self.behind = None, delay - min(self.lows, default=least)
+            self.behind = delay - min(self.lows, default=least)
             verdict = "stale" if delay - least > timeout_ns else ""
+            if not verdict:  # a late command of another program is no evidence against a proof
+                self.since_ns = None
         self.late = self.late or (verdict == "stale" and least is not None)
         if still:
             verdict, self.advance = "stamps", 0.0
