@@ -28,7 +28,7 @@ RISES = 0.0005
 HOUR_NS = 3600 * NS
 """The least delay may rise by one timeout in this time. A clock that was silent for it is new."""
 
-REMEMBERED = 16
+REMEMBERED = 64
 """Clocks of one source that the robot remembers: it forgets those that it does not refuse."""
 
 

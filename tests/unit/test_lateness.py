@@ -278,6 +278,16 @@ def test_no_number_of_short_publishers_makes_a_known_queue_new() -> None:
     assert len(sender.ages.clocks) == MAX_CLOCKS
 
 
+def test_a_new_publisher_in_each_minute_drives_and_makes_no_known_clock_new() -> None:
+    sender, hour_s = Sender(1000), 3600
+    for begin_s in range(60, hour_s, 60):
+        name = f"publisher {begin_s}"
+        verdicts = [sender.hear(begin_s * 1000 + n, begin_s * 1000 + n, name) for n in (0, 250)]
+        assert verdicts == ["unproven", ""]
+    at_ms = (hour_s - 1) * 1000  # the known one comes back behind a queue of 3 s
+    assert {sender.hear(at_ms + n, at_ms + n - 3000) for n in range(0, 1500, 50)} == {"stale"}
+
+
 def test_a_table_full_of_refused_clocks_refuses_a_new_one_until_it_forgets_them() -> None:
     sender = Sender()
     names = [f"clock {number}" for number in range(MAX_CLOCKS)]

@@ -27,9 +27,10 @@ RISE_DIVISOR = 2000
 # The least delay rises by at most one timeout in any hour: its lowest values in slots limit it.
 MEMORY_NS, SLOT_NS = 3600 * NS_PER_S, 600 * NS_PER_S
 
-# Of a source. A full table never forgets a refusal: it drops a clock that is not proven, else the
-# one that was silent longest and was not refused since its last accepted command, else none.
-MAX_CLOCKS = 16
+# Of a source: a new publisher in each minute of `MEMORY_NS` makes no known clock new, nor is it
+# refused. A full table never forgets a refusal: it drops a clock that is not proven, else the one
+# that was silent longest and was not refused since its last accepted command, else none.
+MAX_CLOCKS = 64
 
 LASTING_NS = 2 * NS_PER_S  # refusals for this time are no passing state, and their cause is named
 
