@@ -16,8 +16,8 @@ from msgspec.structs import replace
 
 # For which `core/motion/ages.py` refuses a command.
 AgeCode = Literal[
-    "no_echo", "other_run", "from_future", "too_old", "round_trip", "not_newer", "stalled",
-    "unproven", "early", "stale", "set_back", "stamps", "too_many_clocks",
+    "no_echo", "other_run", "from_future", "too_old", "round_trip", "not_newer", "copied",
+    "stalled", "unproven", "early", "stale", "set_back", "stamps", "too_many_clocks",
 ]  # fmt: skip
 
 ObjectionCode = Literal["unknown_source", "not_finite", "too_many_senders"]
@@ -115,6 +115,10 @@ round_trip
 not_newer
     a command of {source} is not newer than the last accepted one of its sender: the network
     repeated or swapped commands, or the sender's stamps or numbers do not rise
+copied
+    a command of {source} is refused, because two programs send with this sender id: their numbers
+    fall and come back;
+    -> give each program a sender id of its own, and choose it anew at each start
 unproven
     {source} is new: the robot follows it when the delays of its commands have not fallen for
     {seconds:g} s; this is not an error

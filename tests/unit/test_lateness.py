@@ -352,3 +352,27 @@ def test_echoes_are_ordered_by_the_beat_and_then_by_the_number_and_must_go_on(
     assert ages.judge_age(echo(0, number, beat_ms), order, TIMEOUT_NS, stalled=False) == verdict
     plain = Command("app", SPEED, 1001 * NS_PER_S, 7, "a", "a", sequence=9)
     assert ages.judge_age(plain, order, TIMEOUT_NS, stalled=False) == "no_echo"
+
+
+@each("ahead", [0, 3, 10_000])  # 0: a program that was forked
+def test_two_programs_with_one_sender_id_are_noticed(ahead: int) -> None:
+    ages, order, verdicts = Ages(), Order(), []
+    for beat in range(1, 250):  # 12 s
+        at_ns = 1000 * NS_PER_S + beat * 50 * MS
+        for late_ms in (0, 20) if beat < 100 else (0,):
+            fresh = Echo(RUN, at_ns + late_ms * MS)
+            number = beat + ahead * (late_ms > 0)
+            command = Command(
+                "app", SPEED, fresh.beat_ns, 5, "a", "a", sequence=number, echo=fresh, age_ns=0
+            )
+            verdicts.append(ages.judge_age(command, order, TIMEOUT_NS, stalled=False))
+    assert verdicts[:3] == ["", "", ""]
+    assert verdicts[4:198].count("copied") >= 95
+    assert verdicts[-1] == ""  # the other one has ended
+
+
+@each("sequences", [[*range(200, 230), *range(40), *range(30)], [7] * 50])
+def test_a_program_that_counts_anew_or_not_at_all_is_no_copy(sequences: list[int]) -> None:
+    ages, order = Ages(), Order()
+    for beat, number in enumerate(sequences):
+        assert ages.judge_age(echo(0, number, 100 + beat), order, TIMEOUT_NS, stalled=False) == ""

@@ -343,6 +343,7 @@ class SourceState(Message, frozen=True):
     - too_old, round_trip: the echoes show late commands, or such a round trip for long.
     - no_echo, other_run, from_future: the command has no echo of a beat of this daemon.
     - not_newer: the command is not newer than the last accepted one of its sender.
+    - copied: two programs send with one sender id.
     - stalled: the daemon stalled, and waits for the next command.
     - higher, equal: a source of higher or of the same priority controls the robot.
     - senders: other senders of this source wait until the sender that drives falls silent.

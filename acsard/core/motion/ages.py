@@ -50,6 +50,7 @@ class Order(Struct, gc=False):
     at_ns: Ns = 0
     old_ns: Ns | None = None  # first command since then that was too old
     round_trip_ns: Ns = 0  # least age of these commands
+    fell: tuple[Ns, int] = (-SILENT_NS, 0)  # when the number last did not rise, and from which one
 
     def judge_echo(self, command: Command, timeout_ns: Ns) -> AgeVerdict:
         age_ns, at_ns = command.age_ns, command.arrived_ns
@@ -66,6 +67,12 @@ class Order(Struct, gc=False):
             return "too_old" if at_ns - self.old_ns < LASTING_NS else "round_trip"
         if (command.echo.beat_ns, number(command)) <= (self.beat_ns, self.sequence):
             return "not_newer"
+        if number(command) <= self.sequence:
+            # The program counts anew, unless the higher numbers came back: then there are two.
+            fell_ns, before = self.fell
+            if at_ns - fell_ns < SILENT_NS and self.sequence > before:
+                return "copied"
+            self.fell = at_ns, self.sequence
         return ""
 
     def overtook(self, command: Command, timeout_ns: Ns) -> bool:
