@@ -32,21 +32,21 @@ class Loan:
 
     def __init__(self, config: Config, tell: Callable[[str], None]) -> None:
         self._where, self._port, self._tell = address_of(config), config.mcu.port, tell
-        self._latched: tuple[int, ...] | None = None  # by the daemon; None: nothing is borrowed
+        self._numbers: list[int] = []  # what the daemon latched, then the loan; [] before it
         self.outdated = False  # the daemon's wheels: the file has others now
 
     def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *_: object) -> None:
-        numbers, self._latched = self._latched, None
-        if numbers is None:
+        numbers, self._numbers = self._numbers, []
+        if not numbers:
             return
         try:
             with open_connection(self._where) as robot:
-                # The port opens also if the call is refused: it names no cause of a robot that was
-                # off before, or whose wheels are outdated.
-                reply = robot.call("activate", numbers=[] if self.outdated else list(numbers))
+                # It ends the loan even if it is refused: it names no cause of a robot that was off
+                # before, or whose wheels are outdated.
+                reply = robot.call("activate", numbers=numbers[-1:] if self.outdated else numbers)
         except AcsardError as error:
             self._tell(f"the daemon did not take the port back ({error}): `acsard call activate`")
         else:
@@ -65,7 +65,7 @@ class Loan:
             reply = robot.call("deactivate", release_port=True)
         if not reply.success:
             raise InUseError(f"the daemon keeps {self._port}: {reply.message}")
-        self._latched = tuple(reply.data.numbers)
+        self._numbers = reply.data.numbers
         self._tell("the daemon has switched the robot off, and lends the port for this check")
 
     @contextmanager

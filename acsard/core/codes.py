@@ -16,8 +16,8 @@ from msgspec.structs import replace
 
 # For which `core/motion/ages.py` refuses a command.
 AgeCode = Literal[
-    "no_echo", "other_run", "from_future", "too_old", "round_trip", "not_newer", "stalled",
-    "unproven", "early", "stale", "set_back", "stamps", "too_many_clocks",
+    "no_echo", "other_run", "from_future", "too_old", "round_trip", "not_newer", "copied",
+    "stalled", "unproven", "early", "stale", "set_back", "stamps", "too_many_clocks",
 ]  # fmt: skip
 
 ObjectionCode = Literal["unknown_source", "not_finite", "too_many_senders"]
@@ -115,6 +115,10 @@ round_trip
 not_newer
     a command of {source} is not newer than the last accepted one of its sender: the network
     repeated or swapped commands, or the sender's stamps or numbers do not rise
+copied
+    a command of {source} is refused, because two programs send with this sender id: their numbers
+    fall and come back;
+    -> give each program a sender id of its own, and choose it anew at each start
 unproven
     {source} is new: the robot follows it when the delays of its commands have not fallen for
     {seconds:g} s; this is not an error
@@ -126,16 +130,18 @@ stale
     stamps: the network delays them;
     -> if this goes on, check the network
 set_back
-    commands of {source} arrive {seconds:g} s later than its earliest ones, by their stamps: the
-    sender's clock was set back, or its commands wait in a queue;
-    -> if the clock was set, restart the sender or type `acsard call activate`; otherwise check the
-    network
+    commands of {source} arrive {seconds:g} s later than its earliest ones, by their stamps: its
+    computer's clock was slewed or set back by as much, or they wait in a queue, and stamps do not
+    show which;
+    -> did the clock change (`chronyc tracking` or `timedatectl` there)? Then restart the sender or
+    type `acsard call activate`. Otherwise look for the queue, or for another program on this key
+    whose clock is ahead: without a `sender` they share one
 stamps
     the stamps of {source} do not advance with time ({note});
     -> is use_sim_time on, or are the stamps copied from another message? Send the time of the
     command, or no stamp
 too_many_clocks
-    a new sender of {source} is refused, because the commands of 16 others came too late, which the
+    a new sender of {source} is refused, because the commands of 64 others came too late, which the
     daemon remembers for an hour;
     -> check their network, or type `acsard call activate`, which forgets them
 stalled

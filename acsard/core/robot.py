@@ -77,6 +77,11 @@ PORT_LENT = (
     "unknown until `acsard call reset_odometry` or `acsard call set_pose`"
 )
 
+ALREADY_LENT = (
+    "the serial port is lent to another program already: wait until that ends, or type "
+    "`acsard call activate` if it ended without giving the port back"
+)
+
 NOTHING_CHANGED = "nothing changed: all settings already have these values"
 
 UNDECLARED = "with fewer than 400 encoder counts per turn of a wheel, set mcu.encoder_counts"
@@ -493,10 +498,10 @@ class Robot:
                     state.arbiter.require_neutral(asked_ns)
                 return message, numbers
             case "activate":
-                if life.port_released:
-                    life.port_released = False  # even if it is refused
-                    state.odometry.uncertainty.lose()
+                if life.loan in (request.numbers or ()):
+                    self._end_loan()  # even if the rest is refused
                 numbers = life.activate(request.numbers, asked_ns)
+                self._end_loan()
                 state.arbiter.forget_clocks()
                 state.arbiter.require_neutral(asked_ns)
                 return "active", numbers
@@ -519,13 +524,19 @@ class Robot:
             raise RefusedError("the built-in simulator has no serial port")
         if not self._at_rest or self._rolls(now.mono_ns):
             raise RefusedError("the port is released only while the robot rests")
+        if state.life.loan:
+            raise RefusedError(ALREADY_LENT)
         numbers: tuple[int, ...] = ()
         if state.life.mode not in (Mode.STOPPED, Mode.FAULT, Mode.INACTIVE):
             state.life.deactivate(by, now)
             numbers = (state.life.latches.last,)
-        state.life.port_released = True
         state.checks.gyro.rest_s = 0.0
-        return PORT_LENT, numbers
+        return PORT_LENT, (*numbers, state.life.lend())
+
+    def _end_loan(self) -> None:
+        if self.state.life.loan:
+            self.state.life.loan = 0
+            self.state.odometry.uncertainty.lose()
 
     @property
     def _at_rest(self) -> bool:

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import math
 import re
+from collections import deque
 from contextlib import nullcontext
+from functools import partial
 
 import pytest
 from msgspec import json
@@ -12,6 +14,7 @@ from msgspec.structs import replace
 
 from acsard.core.config.settings import (
     Config,
+    LimitsConfig,
     McuConfig,
     SimConfig,
     WheelMap,
@@ -239,3 +242,51 @@ def test_an_echo_beside_a_board_is_never_driven(period: float, latency_ms: int) 
         world.drive(0.5, seconds=2.0)
         assert (world.state.link, world.state.code) == ("booting", "echo")
         assert moving([line for _, line in world.port.sent]) == []
+
+
+# Motors that follow exactly are no board without encoders
+
+
+@pytest.mark.variations(3)
+@pytest.mark.parametrize(
+    ("lag_s", "acceleration"), [(0.001, 1.0), (0.005, 0.2), (0.01, 0.2), (0.01, 1.0), (0.02, 0.2)]
+)
+@four_and_two
+def test_servo_drives_that_follow_each_ramp_to_the_hundredth_keep_the_link(
+    lag_s: float, acceleration: float, wheels: WheelMap
+) -> None:
+    limits = LimitsConfig(linear_acceleration=acceleration, linear_deceleration=acceleration)
+    sim = SimConfig(motor_time_constant=lag_s, encoder_counts=300_000)
+    world = World(Config(limits=limits, mcu=McuConfig(wheels=wheels), sim=sim))
+    for _ in range(15):
+        world.drive(0.1)
+        world.hold(0.0)
+    assert [event.text for event in world.events if event.name == "link_check"] == []
+    assert world.state.link == "up"
+
+
+@pytest.mark.variations(3)
+@pytest.mark.parametrize("check", ["off", "on"])
+@pytest.mark.parametrize(("separator", "late"), [(",", 0), (",", 1), (", ", 0)])
+@pytest.mark.parametrize("jerk", [0.0, 3.0])
+def test_a_board_that_reports_its_set_points_in_any_form_is_found_within_six_ramps(
+    check: str, separator: str, late: int, jerk: float
+) -> None:
+    world = World(
+        Config(mcu=McuConfig(link_check=check), limits=LimitsConfig(linear_jerk=jerk))  # type: ignore[arg-type]
+    )
+    board = world.mcu
+    set_points = deque([[0.0] * 4] * (1 + late), 1 + late)
+
+    def speeds(now_ns: int) -> list[float]:
+        every = board.vehicle.set_points
+        set_points.append([every[wheels[0]] * forward for wheels, forward in board._wiring])
+        return set_points[0]
+
+    board._speeds = speeds  # type: ignore[method-assign]
+    with board.switched(partial(replace, separator=separator)):
+        for _ in range(3):
+            world.drive(0.5)
+            world.hold(0.0)
+    assert (world.state.link, world.state.code) == ("stale", "set_points")
+    assert abs(world.mcu.vehicle.pose.x) < 2.0

@@ -141,6 +141,24 @@ def test_a_clock_that_was_set_forwards_drives_again_after_one_timeout(way: Way) 
     assert world.state.mode == "driving", world.state.reason
 
 
+@pytest.mark.parametrize("mends", ["activate", "a restart"])
+def test_a_slewed_clock_is_named_beside_the_queue_that_looks_like_it(mends: str) -> None:
+    world = quiet()
+    speaker = Speaker(world, "rmw")
+    speaker.open()
+    for _ in range(200):
+        speaker.ahead = max(-0.6, speaker.ahead - 0.00415)
+        speaker.hold(0.4, 0.05)
+    assert (world.state.mode, waits_for(world)) == ("ready", "set_back")
+    assert "arrive 0.6 s later than its earliest ones" in world.state.reason
+    assert "slewed or set back by as much, or they wait in a queue" in world.state.reason
+    if mends == "activate":
+        assert world.call("activate").success
+    else:
+        speaker = Speaker(world, "rmw", "restarted", speaker.ahead)
+    speaker.open()
+
+
 # order
 
 

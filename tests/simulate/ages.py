@@ -28,7 +28,7 @@ RISES = 0.0005
 HOUR_NS = 3600 * NS
 """The least delay may rise by one timeout in this time. A clock that was silent for it is new."""
 
-REMEMBERED = 16
+REMEMBERED = 64
 """Clocks of one source that the robot remembers: it forgets those that it does not refuse."""
 
 
@@ -101,7 +101,8 @@ class Clock:
         passed_ns = at_ns - since_ns
         rises_ns = min(passed_ns * RISES, timeout_ns * (1 + passed_ns // HOUR_NS))
         if delay_ns >= least_ns - LOWER_NS:
-            self._lower.clear()
+            if delay_ns <= least_ns + rises_ns + timeout_ns + MARGIN_NS:
+                self._lower.clear()
             self._reached_ns = delay_ns
             if delay_ns < least_ns + rises_ns:
                 self.least = at_ns, delay_ns

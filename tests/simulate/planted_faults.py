@@ -34,7 +34,8 @@ PLANS_OF_FAULT = {
     "session gap": "mute", "session stale": "mute", "odometry silent": "mute",
     "odometry gap": "mute",
     "loop end": "restart", "robot end": "restart", "gate late": "stall in step",
-    "session echo": "half_duplex", "case 11": "echo", "limits clock": "wall",
+    "session echo": "half_duplex", "session set points": "ideal board", "case 11": "echo",
+    "limits clock": "wall",
     "robot unsent": "block", "robot limits": "limits", "lifecycle number": "typed",
     "lifecycle fault": "driver_fault", "ages echo": "queue from the start",
     "gyro hangs": "hangs", "odometry still": "mute", "arbiter silence": "long silence",
@@ -350,6 +351,10 @@ FAULTS = (
           "core/link/echo_check.py",
           "least = min(self.lines, RETURNED_FRACTION * (written - self.written))",
           "least = self.lines"),
+    fault("session set points",
+          "motors that repeat the first line of some ramps are taken for no encoders",
+          "core/link/echo_check.py", "            self.ramps, self.asked_of_ramps = 0, False\n",
+          "            pass\n"),
     # log
     fault("log flooded", "a client can fill the log", "core/motion/event_throttle.py", "BURST = 5",
           "BURST = 500"),
@@ -569,7 +574,7 @@ CASES = (
           "core/summary.py", "silent = odometry.pose, session.silent(now_ns)",
           "silent = odometry.pose, False"),
     fault("case 11", "TX joined to RX looks like a board, and the daemon drives it",
-          "core/link/echo_check.py", "            self.due = True\n        elif",
-          "            pass\n        elif"),
+          "core/link/echo_check.py", "            self.due = True\n\n\ndef",
+          "            pass\n\n\ndef"),
 )
 # fmt: on

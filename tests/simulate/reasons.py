@@ -17,8 +17,8 @@ if TYPE_CHECKING:
     from tests.simulate.actors import Run
 
 LATE = (
-    "no_echo", "other_run", "from_future", "too_old", "round_trip", "not_newer", "early", "stale",
-    "set_back", "stamps",
+    "no_echo", "other_run", "from_future", "too_old", "round_trip", "not_newer", "copied", "early",
+    "stale", "set_back", "stamps",
 )  # fmt: skip
 
 KINDS = {

@@ -26,6 +26,7 @@ class LinkBench:
         self.setup = LinkSetup.of(mcu, 100.0, longest_reply=longest_reply)
         self.session, self.out = McuSession(), Output()
         self.made: bytes | None = None  # the line that waits for the port
+        self.speeds = SLOW  # in this line
         self.now_ns = self.made_ns = 1000 * MS
         self.opened, self.port_open = 0, False
 
@@ -47,7 +48,7 @@ class LinkBench:
         return [event.name for event in self.session.events]
 
     def line(self, speeds: WheelSpeeds = SLOW) -> bytes | None:
-        self.made_ns = self.now_ns
+        self.made_ns, self.speeds = self.now_ns, speeds
         self.made = self.session.line(self.setup, self.out, self.now_ns, speeds)
         return self.made
 
@@ -76,7 +77,9 @@ class LinkBench:
             self.out.dropped(made_ns, closed=session.link == "down", trip=False)
             return
         silent = session.silent(made_ns)
-        self.out.wrote(self.setup, line, made_ns, made_ns, AT_REST, SLOW, silent=silent, trip=False)
+        self.out.wrote(
+            self.setup, line, made_ns, made_ns, AT_REST, self.speeds, silent=silent, trip=False
+        )
         if line == QUESTION_LINE:
             session.asks(made_ns)
 

@@ -204,6 +204,20 @@ def test_a_lower_delay_counts_when_the_commands_of_one_timeout_confirm_it() -> N
     assert sender.hear(3750, 3500) == "stale"
 
 
+@each("every_ms", [10, 50, 200])
+@each("ahead_ms", [0, 40, 280, 3000])
+def test_a_prompt_program_counts_beside_the_backlog_of_another_one_with_its_identity(
+    every_ms: int, ahead_ms: int
+) -> None:
+    sender, verdicts = Sender(1000), {}
+    for at_ms in range(9000, 12_000, 10):
+        if at_ms % every_ms == 0:  # sent from 1.05 s on
+            assert sender.hear(at_ms, 1050 + (at_ms - 9000) / every_ms * 5) != ""
+        if at_ms % 50 == 5 or at_ms % 50 == 0:
+            verdicts[at_ms] = sender.hear(at_ms + 5, at_ms + 5 + ahead_ms)
+    assert {verdict for at_ms, verdict in verdicts.items() if at_ms > 9600} == {""}
+
+
 def test_the_least_delay_rises_by_at_most_one_timeout_in_any_hour() -> None:
     sender, hour_ms = Sender(1000), 3_600_000
     obeyed: list[tuple[int, float]] = []
@@ -214,6 +228,22 @@ def test_the_least_delay_rises_by_at_most_one_timeout_in_any_hour() -> None:
     last_ms, late_ms = obeyed[-1]
     assert last_ms > hour_ms  # a clock that drifts is followed
     assert late_ms <= 250 * (1 + last_ms / hour_ms) + 1
+
+
+@each(("back_ms", "at_s"), [(200, 0), (300, 100), (400, 300), (500, 500), (510, None)])
+def test_a_clock_that_was_slewed_back_and_a_queue_of_as_much_count_at_the_same_time(
+    back_ms: int, at_s: int | None
+) -> None:
+    """Both have these arrivals and stamps, so what heals the one obeys the other."""
+    sender, late_ms, refused_s = Sender(1000), 0.0, 0.0
+    for at_ms in range(1050, 1_200_000, 50):
+        late_ms = min(back_ms, late_ms + 4.15)  # 83 ms per second, as chrony slews
+        if sender.hear(at_ms, at_ms - late_ms):
+            refused_s = at_ms / 1000
+    if at_s is None:
+        assert refused_s > 1199.9
+    else:
+        assert abs(refused_s - at_s) <= 4.0
 
 
 @each(
@@ -246,6 +276,16 @@ def test_no_number_of_short_publishers_makes_a_known_queue_new() -> None:
             verdict = sender.hear(at_ms, at_ms, f"publisher {number}")
         assert verdict == ""
     assert len(sender.ages.clocks) == MAX_CLOCKS
+
+
+def test_a_new_publisher_in_each_minute_drives_and_makes_no_known_clock_new() -> None:
+    sender, hour_s = Sender(1000), 3600
+    for begin_s in range(60, hour_s, 60):
+        name = f"publisher {begin_s}"
+        verdicts = [sender.hear(begin_s * 1000 + n, begin_s * 1000 + n, name) for n in (0, 250)]
+        assert verdicts == ["unproven", ""]
+    at_ms = (hour_s - 1) * 1000  # the known one comes back behind a queue of 3 s
+    assert {sender.hear(at_ms + n, at_ms + n - 3000) for n in range(0, 1500, 50)} == {"stale"}
 
 
 def test_a_table_full_of_refused_clocks_refuses_a_new_one_until_it_forgets_them() -> None:
@@ -312,3 +352,27 @@ def test_echoes_are_ordered_by_the_beat_and_then_by_the_number_and_must_go_on(
     assert ages.judge_age(echo(0, number, beat_ms), order, TIMEOUT_NS, stalled=False) == verdict
     plain = Command("app", SPEED, 1001 * NS_PER_S, 7, "a", "a", sequence=9)
     assert ages.judge_age(plain, order, TIMEOUT_NS, stalled=False) == "no_echo"
+
+
+@each("ahead", [0, 3, 10_000])  # 0: a program that was forked
+def test_two_programs_with_one_sender_id_are_noticed(ahead: int) -> None:
+    ages, order, verdicts = Ages(), Order(), []
+    for beat in range(1, 250):  # 12 s
+        at_ns = 1000 * NS_PER_S + beat * 50 * MS
+        for late_ms in (0, 20) if beat < 100 else (0,):
+            fresh = Echo(RUN, at_ns + late_ms * MS)
+            number = beat + ahead * (late_ms > 0)
+            command = Command(
+                "app", SPEED, fresh.beat_ns, 5, "a", "a", sequence=number, echo=fresh, age_ns=0
+            )
+            verdicts.append(ages.judge_age(command, order, TIMEOUT_NS, stalled=False))
+    assert verdicts[:3] == ["", "", ""]
+    assert verdicts[4:198].count("copied") >= 95
+    assert verdicts[-1] == ""  # the other one has ended
+
+
+@each("sequences", [[*range(200, 230), *range(40), *range(30)], [7] * 50])
+def test_a_program_that_counts_anew_or_not_at_all_is_no_copy(sequences: list[int]) -> None:
+    ages, order = Ages(), Order()
+    for beat, number in enumerate(sequences):
+        assert ages.judge_age(echo(0, number, 100 + beat), order, TIMEOUT_NS, stalled=False) == ""

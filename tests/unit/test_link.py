@@ -243,7 +243,7 @@ def test_a_board_that_repeats_commands_but_not_the_question_has_no_encoders(enco
         if bench.link != "up":
             break
     assert bench.link == ("stale" if encoders else "up")
-    assert not encoders or (bench.why.code == "set_points" and 150 < n < 300)
+    assert not encoders or (bench.why.code == "set_points" and 100 < n < 300)
 
 
 def test_an_ideal_motor_lags_by_one_line_in_a_long_ramp_but_not_at_its_ends() -> None:

@@ -64,7 +64,7 @@ def test_the_port_is_released_at_rest_and_a_robot_that_was_off_stays_off(
         rig.answer(before)
     mode = rig.mode
     (answer,) = rig.asked(Request("deactivate", 1, release_port=True)).answers
-    assert (answer.success, len(answer.numbers)) == (True, 0 if before else 1)
+    assert (answer.success, len(answer.numbers)) == (True, 1 if before else 2)
     assert (rig.robot.port_released, rig.mode) == (True, mode if before else "inactive")
     rig.asked(Request("activate", 2, numbers=answer.numbers))
     assert (rig.robot.port_released, rig.mode) == (False, mode)
@@ -132,9 +132,43 @@ def test_the_port_is_not_released_while_the_board_reports_wheels_above_5_cm_a_se
     rig.run(5)
     (answer,) = rig.asked(Request("deactivate", 1, release_port=True)).answers
     assert (answer.success, rig.robot.port_released) == (released, released)
-    rig.unplug().run(100)
-    (answer,) = rig.asked(Request("deactivate", 1, release_port=True)).answers
-    assert answer.success, "a silent board says nothing about its wheels"
+    if not released:
+        rig.unplug().run(100)
+        (answer,) = rig.asked(Request("deactivate", 1, release_port=True)).answers
+        assert answer.success, "a silent board says nothing about its wheels"
+
+
+@each("numbers", [None, (), (99,)])
+@each("before", [None, "stop", "deactivate"])
+def test_neither_a_second_borrower_nor_a_refused_activate_ends_the_loan_of_the_port(
+    before: Verb | None, numbers: tuple[int, ...] | None
+) -> None:
+    rig = Rig(REAL).linked()
+    if before:
+        rig.answer(before)
+    mode = rig.mode
+    (lent,) = rig.asked(Request("deactivate", 1, release_port=True)).answers
+    rig.unplug().run(5)
+    (second,) = rig.asked(Request("deactivate", 2, release_port=True)).answers
+    assert (second.success, second.numbers) == (False, ())
+    assert "lent to another program" in second.message
+    (refused,) = rig.asked(Request("activate", 3, numbers=numbers)).answers
+    assert (refused.success, rig.robot.port_released) == (False, True)
+    rig.asked(Request("activate", 4, numbers=lent.numbers))
+    assert (rig.robot.port_released, rig.mode) == (False, mode if before else "waiting")
+
+
+@each("verb", ["clear", "activate"])
+def test_a_person_who_releases_all_causes_of_a_robot_opens_its_port(verb: Verb) -> None:
+    rig = Rig(REAL).linked()
+    if verb == "clear":
+        rig.answer("stop")
+    rig.asked(Request("deactivate", 1, release_port=True))
+    rig.run(250)
+    assert rig.answer(verb).success
+    assert rig.robot.port_released is (verb == "clear")
+    assert rig.answer("activate").success
+    assert not rig.robot.port_released
 
 
 def test_neither_a_moving_robot_nor_the_simulator_built_in_releases_the_port() -> None:

@@ -47,6 +47,7 @@ class Output(Struct):
     rest_ns: Ns = 0  # the last command to move ended: zeros, or the board's watchdog
     # Since the opening of the port: the newest lines, with their ends, and the number of all.
     lines: list[bytes] = []
+    set_points: list[WheelSpeeds] = []  # in `lines`
     count: int = 0
     # Of this session. An older reply, which is not expected any more, may still come.
     open: list[OpenLine] = []
@@ -82,10 +83,11 @@ class Output(Struct):
         self.motion, self.speeds, self.made_ns = motion, speeds, made_ns
         if trip:
             return
-        lines = self.lines
+        lines, set_points = self.lines, self.set_points
         lines.append(line)
+        set_points.append(speeds)
         if len(lines) > COMPARED_LINES:
-            del lines[0]
+            del lines[0], set_points[0]
         self.count += 1
         moves = not line.startswith(setup.rest)
         self.rest_ns = at_ns + WATCHDOG_NS if moves else min(self.rest_ns, at_ns)
@@ -113,6 +115,7 @@ class Output(Struct):
         if port_open:
             self.stop_ns = None
         self.lines.clear()
+        self.set_points.clear()
         self.count = 0
 
     def restart(self) -> None:

@@ -409,6 +409,7 @@ class McuSession(Struct):
         except FrameError as error:
             self._refuse(setup, line, error)
             return None
+        self._echo.measured(speeds, out.set_points, setup.command_interval_ns / NS_PER_S)
         self.good_lines += 1
         before_ns, self._heard_ns = self._heard_ns, at_ns
         if before_ns is not None and at_ns - before_ns >= LONG_GAP_NS:

@@ -343,6 +343,7 @@ class SourceState(Message, frozen=True):
     - too_old, round_trip: the echoes show late commands, or such a round trip for long.
     - no_echo, other_run, from_future: the command has no echo of a beat of this daemon.
     - not_newer: the command is not newer than the last accepted one of its sender.
+    - copied: two programs send with one sender id.
     - stalled: the daemon stalled, and waits for the next command.
     - higher, equal: a source of higher or of the same priority controls the robot.
     - senders: other senders of this source wait until the sender that drives falls silent.
@@ -621,7 +622,8 @@ class ReplyData(Message, frozen=True):
     """What a service call has changed, for programs."""
 
     numbers: list[CauseNumber] = []
-    """Numbers of the causes that the call has latched or released, as in `RobotState.causes`."""
+    """Numbers of the causes that the call has latched or released, as in `RobotState.causes`. The
+    last one of a `deactivate` with `release_port` is that of the loan of the port."""
     changes: dict[str, Change] = {}
     """The settings that the call has changed, by dotted key."""
 
@@ -661,10 +663,11 @@ class SwitchOff(Message, frozen=True):
     """Payload of the service `deactivate`."""
 
     release_port: bool = False
-    """Also close the serial port until the next `activate`, so that another program can use it. The
-    robot must rest. A robot that is stopped or in fault stays so, and only the port is closed. The
-    other program may move the robot, so the pose is unknown until `reset_odometry` or `set_pose`:
-    its variances are 1e9."""
+    """Also lend the serial port to another program, if the robot rests. A robot that is stopped or
+    in fault stays so, and only the port is closed. It opens again at the next `activate` that names
+    the number of this loan, or that is not refused; until then, a second program is refused. The
+    borrower may move the robot, so the pose is unknown until `reset_odometry` or `set_pose`: its
+    variances are 1e9."""
 
 
 class Settings(Message, frozen=True):

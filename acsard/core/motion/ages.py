@@ -3,8 +3,9 @@
 Echo: the daemon measures the age by its own clock, and the echo may be as old as the timeout of the
 source plus `MARGIN_NS`. Stamp: the clock of the sender is not synchronized, so only the rise of the
 delay (arrival minus stamp) above its least value is known. The least delay rises slowly, because
-two clocks drift, and nothing proves it upwards: a clock that was set back, or commands that wait in
-a queue, are refused until `activate` or a new sender id. A refused command changes no timeout.
+two clocks drift, and nothing proves it upwards: a clock that was slewed or set back gives the very
+stamps and arrivals of a queue. Both are refused until the least delay has risen, `activate` or a
+new sender id. A refused command changes no timeout.
 """
 
 from __future__ import annotations
@@ -26,9 +27,10 @@ RISE_DIVISOR = 2000
 # The least delay rises by at most one timeout in any hour: its lowest values in slots limit it.
 MEMORY_NS, SLOT_NS = 3600 * NS_PER_S, 600 * NS_PER_S
 
-# Of a source. A full table never forgets a refusal: it drops a clock that is not proven, else the
-# one that was silent longest and was not refused since its last accepted command, else none.
-MAX_CLOCKS = 16
+# Of a source: a new publisher in each minute of `MEMORY_NS` makes no known clock new, nor is it
+# refused. A full table never forgets a refusal: it drops a clock that is not proven, else the one
+# that was silent longest and was not refused since its last accepted command, else none.
+MAX_CLOCKS = 64
 
 LASTING_NS = 2 * NS_PER_S  # refusals for this time are no passing state, and their cause is named
 
@@ -48,6 +50,7 @@ class Order(Struct, gc=False):
     at_ns: Ns = 0
     old_ns: Ns | None = None  # first command since then that was too old
     round_trip_ns: Ns = 0  # least age of these commands
+    fell: tuple[Ns, int] = (-SILENT_NS, 0)  # when the number last did not rise, and from which one
 
     def judge_echo(self, command: Command, timeout_ns: Ns) -> AgeVerdict:
         age_ns, at_ns = command.age_ns, command.arrived_ns
@@ -64,6 +67,12 @@ class Order(Struct, gc=False):
             return "too_old" if at_ns - self.old_ns < LASTING_NS else "round_trip"
         if (command.echo.beat_ns, number(command)) <= (self.beat_ns, self.sequence):
             return "not_newer"
+        if number(command) <= self.sequence:
+            # The program counts anew, unless the higher numbers came back: then there are two.
+            fell_ns, before = self.fell
+            if at_ns - fell_ns < SILENT_NS and self.sequence > before:
+                return "copied"
+            self.fell = at_ns, self.sequence
         return ""
 
     def overtook(self, command: Command, timeout_ns: Ns) -> bool:
@@ -95,7 +104,7 @@ class Clock(Struct):
     first_refused: tuple[Ns, Ns] | None = None  # arrival and stamp of the first refused command
     cause: AgeVerdict = ""  # of refusals that last
     advance: float = 0.0  # of the stamps, s per second, while refusals last
-    behind: int = 0  # delay above the least one
+    behind: int = 0  # delay above the least one of the last hour
 
     def judge_stamp(self, at_ns: Ns, stamp_ns: Ns, timeout_ns: Ns) -> AgeVerdict:
         still = self._stands_still(at_ns, stamp_ns, timeout_ns)
@@ -105,8 +114,10 @@ class Clock(Struct):
         if least is None or delay < least - MARGIN_NS:
             verdict = self._prove(at_ns, delay, timeout_ns)
         else:
-            self.since_ns, self.behind = None, delay - least
+            self.behind = delay - min(self.lows, default=least)
             verdict = "stale" if delay - least > timeout_ns else ""
+            if not verdict:  # a late command of another program is no evidence against a proof
+                self.since_ns = None
         self.late = self.late or (verdict == "stale" and least is not None)
         if still:
             verdict, self.advance = "stamps", 0.0

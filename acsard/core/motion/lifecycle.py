@@ -5,6 +5,8 @@ those that its caller was shown. A plain `clear` names none, so it releases the 
 any, else the stops, once each fault and stop has been published for `SHOWN_S`. `activate` releases
 what `deactivate` latched, by the same rule. `clear` releases nothing while a cause lasts: a pressed
 input of the board, an empty battery, or a fault of a motor driver.
+
+A loan of the serial port has a number, too. It ends with an `activate` that names it or is allowed.
 """
 
 from __future__ import annotations
@@ -13,6 +15,7 @@ import math
 from collections.abc import Collection
 
 from msgspec import Struct
+from msgspec.structs import replace
 
 from acsard.core.codes import Reason, reason
 from acsard.core.motion.latches import (
@@ -50,7 +53,7 @@ class Lifecycle(Struct):
     unshown: bool = True  # call `begin`
     begun: bool = False  # a step of this run has published its state
     stop_asked_ns: Ns = NEVER_NS  # latest arrival of a client's stop
-    port_released: bool = False  # another program may use the serial port
+    loan: int = 0  # the number of the serial port's loan to another program; 0: it is ours
 
     def __post_init__(self) -> None:
         self._derive()
@@ -176,6 +179,16 @@ class Lifecycle(Struct):
         why = reason("switched_off", by=by or NAMELESS)
         self._use(latched(self.latches, "inactive", why, now.wall_ns, by))
         return "inactive: the robot brakes to rest; `acsard call activate` switches it on again"
+
+    def lend(self) -> int:
+        """Lend the serial port, and return the number of the loan."""
+        self._use(replace(self.latches, last=self.latches.last + 1))
+        self.loan = self.latches.last
+        return self.loan
+
+    @property
+    def port_released(self) -> bool:
+        return self.loan > 0
 
     @property
     def why(self) -> Reason:
