@@ -618,6 +618,10 @@ MOMENTS: dict[str, tuple[float, Callable[[Plan], bool], Callable[[Plan, random.R
     "stuck encoder": (0.03, _is_plain, _driven(moments_of_wheels.stuck_encoder)),
     "replies twice": (0.03, _is_plain, _driven(moments_of_wheels.replies_twice)),
     "late network": (0.05, _any, _late_network),
+    "to and fro": (0.07, _any, _driven(moments_of_wheels.to_and_fro)),
+    "flickering link": (0.06, _any, _driven(moments_of_wheels.flickering)),
+    "slewed clock": (0.05, _any, _driven(moments_of_age.slewed)),
+    "short publishers": (0.04, _any, _driven(moments_of_age.publishers)),
 }
 """The share of the plans that have each moment, of those that can have it, whether a plan can have
 it, and what makes it."""
