@@ -141,13 +141,16 @@ def publishers(plan: Plan, dice: random.Random, driver: Sender) -> None:
         plan["senders"].append(program)
         return program
 
-    for _ in range(dice.choice((8, 15, 16, 17, 20))):
+    timeout = _timeout(plan, driver)
+    # In most plans, all are there for long enough to have their clocks proven.
+    longer = dice.choice(((timeout,), (timeout,), (0.0, timeout)))
+    for _ in range(dice.choice((8, 15, 17, 20, 20))):
         zeros = dice.choice((0.1, 0.4, 0.8, 5.0))
-        add(at, at + dice.uniform(0.4, 1.5), [
+        add(at, at + dice.uniform(0.4, 1.5) + dice.choice(longer), [
             [round(at, 3), 0.0, 0.0], [round(at + zeros, 3), *speeds(dice)],
         ])  # fmt: skip
         at += dice.uniform(0.3, 1.2)
-    at += 2.0 + _timeout(plan, driver)
+    at += 2.0 + timeout
     phases: list[list[Any]] = []
     last = add(at, plan["seconds"], phases)
     last["even"] = True

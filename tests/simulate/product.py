@@ -131,12 +131,9 @@ class Disk(Keeper):
         self._running = True
         self._written = self.latches
         """The latches in the file."""
+        self.behind = False
+        """The disk was full when the daemon last wrote, so the file lacks the newest latches."""
         self._data = encode("acsar", self._written)
-
-    @property
-    def behind(self) -> bool:
-        """Whether the file lacks the newest latches."""
-        return self._written != self.latches
 
     def fill(self, full: bool) -> None:
         """Fill the disk, so that nothing can be written, or make space again.
@@ -150,6 +147,7 @@ class Disk(Keeper):
     def keep(self, latches: Latches) -> None:
         self.latches = latches
         self.trouble = unwritable("FILE", "no space left on device") if self.full else ""
+        self.behind = self.full and self._written != latches
         if not self.full:
             self._data, self._written = encode("acsar", latches), latches
 
@@ -184,6 +182,7 @@ class Disk(Keeper):
         if self.full:
             self.trouble = unwritable("FILE", "no space left on device")
             self.latches = not_writable(latches, "FILE", "no space left on device", now)
+        self.behind = self.full
         return self.latches
 
 

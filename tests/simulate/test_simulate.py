@@ -43,10 +43,10 @@ def test_every_plan_is_legal_and_every_kind_of_trouble_is_drawn() -> None:
 
 
 HAPPENS = {
-    "to and fro": {"commands that turn": 100, "stuck wheels": 1000},
-    "flickering link": {"link is stale while moving": 20},
-    "slewed clock": {"slewed commands": 200, "lawful looks": 1000},
-    "short publishers": {"senders": 20, "lawful looks": 200},
+    "forward and back": {"commands that turn": 100, "stuck wheels": 1000},
+    "dropouts": {"link is stale while moving": 20},
+    "clock that is slewed": {"slewed commands": 200, "lawful looks": 1000},
+    "short-lived publishers": {"senders": 20, "lawful looks": 200},
     "late network": {"moving lines": 500, "clear": 1},
 }
 """What happens at least so often in three plans with each of these moments."""
