@@ -118,9 +118,10 @@ def publishers(plan: Plan, dice: random.Random, driver: Sender) -> None:
     The daemon knows its clock from before the queue. At the end one more program comes, which is
     prompt, and drives.
     """
-    plan["seconds"] = max(plan["seconds"], 60.0)
-    begin = dice.uniform(6.0, 9.0)
-    late = round(_timeout(plan, driver) + dice.choice((0.3, 1.0, 3.0, 8.0)), 3)
+    timeout = _timeout(plan, driver)
+    begin = dice.uniform(6.0, 9.0) + max(0.0, timeout - 3.0)
+    plan["seconds"] = max(plan["seconds"], 60.0 + 2.0 * max(0.0, timeout - 3.0))
+    late = round(timeout + dice.choice((0.3, 1.0, 3.0, 8.0)), 3)
     driver |= {
         "way": dice.choice(("rmw", "rmw", "signed")), "refused": True, "hz": 20.0,
         "phases": _stop_and_go(plan, dice, 0.0),
@@ -141,7 +142,6 @@ def publishers(plan: Plan, dice: random.Random, driver: Sender) -> None:
         plan["senders"].append(program)
         return program
 
-    timeout = _timeout(plan, driver)
     # In most plans, all are there for long enough to have their clocks proven.
     longer = dice.choice(((timeout,), (timeout,), (0.0, timeout)))
     for _ in range(dice.choice((8, 15, 17, 20, 20))):
