@@ -7,6 +7,7 @@ to do. It shows that these steps are enough, and that the robot stays at rest af
 
 from __future__ import annotations
 
+import random
 import re
 from functools import partial
 from pathlib import Path
@@ -345,6 +346,41 @@ def test_a_tool_drives_after_what_the_page_says_and_not_before(
             assert world.state.code == "neutral"
         elif what == "drives":
             assert world.state.mode == "driving", (name, world.state.reason)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("road", ["rmw", "bridge"])
+@pytest.mark.parametrize("smoother", [True, False])
+def test_each_goal_after_the_first_drives_with_its_first_speed(smoother: bool, road: Road) -> None:
+    """The first one of rmw waits for a timeout longer, because its clock is new."""
+    world, dice = World(), random.Random(f"goals {road} {smoother}")
+    tool = Nav2(world, road, smoother=smoother)
+    tool.use(None, PAUSES[ALONE][road])
+    for number in range(8):
+        since_ns, pause_s = world.now_ns, dice.uniform(5.0, 60.0)
+        tool.use(FAST, 0.05 if number or road == "bridge" else 0.3)
+        assert moved(world, since_ns)
+        tool.use(FAST, dice.uniform(1.0, 5.0))
+        assert world.state.mode == "driving"
+        tool.use(*NAV2_GOAL[1:])
+        tool.use(None, pause_s)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("road", "first_s"), [("rmw", 61.0), ("bridge", 10.0)])
+def test_the_first_goal_drives_if_the_silence_before_it_lasted_for_the_lease(
+    road: Road, first_s: float
+) -> None:
+    """A goal that begins sooner is cancelled: behind its zero, the next one waits for a second."""
+    for wait_s, drives in ((first_s - 0.2, False), (first_s + 0.2, True)):
+        world = World()
+        tool = Nav2(world, road)
+        tool.use(None, wait_s)
+        tool.use(FAST, 3.0)
+        assert (world.state.mode == "driving") == drives
+        tool.use(0.0, 1.4)
+        tool.use(FAST, 0.5)
+        assert world.state.mode == "driving"
 
 
 @pytest.mark.slow

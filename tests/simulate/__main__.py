@@ -27,7 +27,7 @@ from tests.simulate.plan import Plan, make_plan
 
 HERE = Path(__file__).parent
 
-LARGEST = ("largest container", "largest text", "largest buffer")
+LARGEST = ("largest container", "largest text", "largest buffer", "largest excess mm")
 """Counts of which the table has the largest value of all runs, and not the sum."""
 
 PlanOf = Callable[[int], Plan]

@@ -24,6 +24,7 @@ from tests.simulate.board_inputs import Inputs, kinds
 from tests.simulate.causes import Call, Cause, Causes
 from tests.simulate.course import Course
 from tests.simulate.damage import Damage
+from tests.simulate.excess import Excess
 from tests.simulate.followed import Followed
 from tests.simulate.liveness import QUIET_FAULTS, TROUBLE_NS, Liveness
 from tests.simulate.log_lines import LogLines
@@ -39,13 +40,14 @@ from tests.simulate.roads import (
     NS,
     Message,
     Sample,
+    is_slewed,
     messages,
     parameters,
     read_reply,
     sample,
 )
 from tests.simulate.spread import Spread
-from tests.simulate.wheels import Wheels
+from tests.simulate.wheels import FAULTS, Wheels
 
 REPLAYED = 10
 """One plan in so many is recorded and replayed."""
@@ -121,6 +123,7 @@ class Run:
         self.half_duplex = HalfDuplex()
         self.followed, self.course = Followed(self.witness), Course(self.witness)
         self.wheels = Wheels(self.witness, lambda: self.product.state())
+        self.excess = Excess(self.witness)
         self.causes = Causes()
         self.counts: Counter[str] = self.witness.counts
         self.liveness = Liveness(self)
@@ -171,6 +174,8 @@ class Run:
         self.moved_ns = -1
         self.beats = Beats()
         self.product = Product(plan["config"], self._see)
+        self._senders: set[str] = set()
+        """The names of the senders of which a message has arrived."""
         self.product.fed = self._fed
         self.product.drops = self._dropped
 
@@ -230,6 +235,8 @@ class Run:
 
     def _begin(self) -> None:
         plan, clocks = self.plan, Counter[str]()
+        if "moment" in plan:
+            self.counts[f"moment {plan['moment']}"] += 1
         self.lasting = [(name, tuple(values)) for name, *values in plan["board"]]
         self.active = list(self.lasting)
         self._board()
@@ -276,6 +283,11 @@ class Run:
         if not self.product.alive:
             return
         waited_ns = self._bus_ns if self._bus_ns <= self.true_ns else 0
+        if sender["name"] not in self._senders:
+            self._senders.add(sender["name"])
+            self.counts["senders"] += 1
+        if is_slewed(sender, message.sent_ns / NS):
+            self.counts["slewed commands"] += 1
         at_ns = self._arrival(max(message.arrives_ns, waited_ns))
         command = self.sampled(sender, message)
         if command is None:
@@ -817,6 +829,8 @@ class Run:
         if snapshot.link == "up" and self._link not in ("up", "stale"):
             # Commands that came before the link do not count.
             witness.disarmed_ns = max(witness.disarmed_ns, true_ns)
+        if snapshot.link == "stale" and self._link == "up" and any(witness.last):
+            self.counts["link is stale while moving"] += 1
         self._link = snapshot.link
         witness.linked = snapshot.link == "up"
         # Lines without the check that the configuration requires make no link.
@@ -837,6 +851,7 @@ class Run:
                     self.half_duplex.line(at_ns + offset, witness.last)
             if any(witness.last):
                 self.moved_ns = at_ns + offset
+        self._judge_excess(true_ns, snapshot, calm_ns + offset)
         driving = snapshot.mode == "driving" and not witness.pending and not self.inputs.limiting
         driven = self.followed.wish if driving else None
         whole = sum(line.endswith(b"\n") for _, line in snapshot.lines)
@@ -876,6 +891,18 @@ class Run:
                     "odometry": snapshot.estimates,
                 }
             )  # fmt: skip
+
+    def _judge_excess(self, true_ns: int, snapshot: StepResult, calm_ns: int) -> None:
+        witness = self.witness
+        self.excess.count()
+        if "runaway" in self._names and self.product.plugged:
+            allowed = "runaway", "mute"
+            others = (at for name, at in witness.troubles.items() if name not in allowed)
+            latched = not snapshot.causes.isdisjoint(FAULTS)
+            quiet_ns = max(calm_ns, *others, 0)
+            self.excess.see(true_ns, self.product.angles(), latched, quiet_ns)
+        else:
+            self.excess.forget()
 
 
 def named(by: str, via: str) -> str:

@@ -554,29 +554,43 @@ def _driven(
 
 
 def _late_network(plan: Plan, dice: random.Random) -> None:
-    """Let the network lose the commands around events that disarm, where a pause arms.
+    """Let the network lose the commands around events that disarm, mostly where a pause arms.
 
-    Each goal ends with a zero and then silence, but some last over an event.
+    Each goal ends with a zero and then silence, but some last over an event, or end without a zero.
+    The network is also lost between two goals, until the second one is under way.
     """
     driver = _alone(plan, dice, [])
+    pauses = dice.random() < 0.8
     for source in plan["config"]["commands"]["sources"]:
-        source["neutral_first"] = "pause"
+        source["neutral_first"] = "pause" if pauses else "zero"
     driver["way"] = dice.choice(("rmw", "rmw", "rmw", "signed", "client", "bridge", "plain"))
     phases: list[list[Any]] = [[0.0, 0.0, 0.0], [1.4, None, None]]
     away: list[list[float]] = []
+
+    def lose(begin: float) -> float:
+        lasts = dice.uniform(0.5, 6.0)
+        away.append([round(begin, 3), round(begin + lasts, 3)])
+        return lasts
+
     at = 3.0
-    while at < plan["seconds"] - 12.0:
+    while at < plan["seconds"] - 14.0:
         phases.append([round(at, 3), *_speed(dice)])
         at += dice.uniform(2.0, 4.0)
-        if dice.random() < 0.6:
-            begin = at + dice.uniform(-1.0, 1.0)
-            away.append([round(begin, 3), round(begin + dice.uniform(0.5, 6.0), 3)])
+        if dice.random() < 0.5:
+            lose(at + dice.uniform(-1.0, 1.0))
             plan["events"] += _disarming(dice, at)
             at += dice.uniform(6.0, 8.0)
-        phases.append([round(at, 3), 0.0, 0.0])
-        at += dice.choice((0.1, 0.5, 1.2))
+        if dice.random() < 0.7:
+            phases.append([round(at, 3), 0.0, 0.0])
+            at += dice.choice((0.1, 0.5, 1.2))
         phases.append([round(at, 3), None, None])
-        at += dice.choice((0.3, 1.2, 3.0, 11.0))
+        pause = dice.choice((0.3, 1.2, 3.0, 11.0))
+        if dice.random() < 0.5:
+            plan["events"] += _disarming(dice, at + 2.6)
+            pause += 3.0
+            if dice.random() < 0.7:
+                pause += lose(at + 2.6 + dice.uniform(0.0, pause - 2.6)) / 2
+        at += pause
     driver |= {"phases": phases, "away": away}
 
 
@@ -618,6 +632,10 @@ MOMENTS: dict[str, tuple[float, Callable[[Plan], bool], Callable[[Plan, random.R
     "stuck encoder": (0.03, _is_plain, _driven(moments_of_wheels.stuck_encoder)),
     "replies twice": (0.03, _is_plain, _driven(moments_of_wheels.replies_twice)),
     "late network": (0.05, _any, _late_network),
+    "forward and back": (0.07, _any, _driven(moments_of_wheels.to_and_fro)),
+    "dropouts": (0.06, _any, _driven(moments_of_wheels.flickering)),
+    "clock that is slewed": (0.05, _any, _driven(moments_of_age.slewed)),
+    "short-lived publishers": (0.04, _any, _driven(moments_of_age.publishers)),
 }
 """The share of the plans that have each moment, of those that can have it, whether a plan can have
 it, and what makes it."""

@@ -45,7 +45,8 @@ SILENT_NS = 10 * NS - MARGIN_NS
 """After a silence of this length a sender may have to send a zero again."""
 
 PROOF_NS = 2 * NS
-"""A new sender shows a steady delay for this time before its commands count."""
+"""A new sender shows a steady delay for this time before its commands count, or for the timeout of
+its source and a second, if that is longer."""
 
 CHARGED_NS = 15 * NS
 """The mean of a battery that was empty rises above all thresholds within this time."""
@@ -104,7 +105,11 @@ class Liveness:
         }
         """Longest time between two commands of each sender that does not pause."""
         self._proofs = {
-            sender["name"]: max(PROOF_NS, int(PROOF_COUNT * NS / sender["hz"]))
+            sender["name"]: max(
+                PROOF_NS,
+                NS + run.witness.timeout[sender["source"]],
+                int(PROOF_COUNT * NS / sender["hz"]),
+            )
             for sender in run.plan["senders"]
             if sender["way"] in FOREIGN
         }
@@ -187,9 +192,14 @@ class Liveness:
         """Return whether this sender has a good network, an unshared clock and no rival."""
         run = self.run
         priority = run.witness.priority
-        rivals = [s for s in run.plan["senders"] if s["name"] != sender["name"]]
+        rivals = [
+            rival
+            for rival in run.plan["senders"]
+            if rival["name"] != sender["name"]
+            and not ("even" in sender and ("refused" in rival or rival["to"] < sender["from"]))
+        ]
         return (
-            (sender["way"] in UNSHARED or "seldom" in sender)
+            (sender["way"] in UNSHARED or "seldom" in sender or "even" in sender)
             and not any(sender[bad] for bad in ("junk", "churn", "loss", "twice", "swap"))
             and not sender["congestion"]
             and not sender.get("bad_stamps")

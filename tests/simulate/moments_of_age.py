@@ -1,12 +1,14 @@
-"""Adds senders whose commands arrive late to some plans, in the ways that no stamp can show.
+"""Adds senders whose commands arrive late to some plans, or whose clocks are slewed.
 
 The commands wait in a queue that exists before the first of them, or that begins in a pause of the
-sender, or the sender is silent for so long that it must send a zero again. `bad_moments.py` says
+sender, or the sender is silent for so long that it must send a zero again. Stamps cannot show this.
+Other programs come and go, and fill the tables of clocks. `bad_moments.py` says
 what a moment is.
 """
 
 from __future__ import annotations
 
+import math
 import random
 from typing import Any
 
@@ -84,6 +86,83 @@ def silence(plan: Plan, dice: random.Random, driver: Sender) -> None:
             break
         at += dice.uniform(2.0, 4.0)
     driver["phases"] = phases
+
+
+def slewed(plan: Plan, dice: random.Random, driver: Sender) -> None:
+    """Slew the clock of a sender that stamps its commands, by 0.1 to 8 %, back and forward.
+
+    In half of the plans no stamp is later than the first ones by more than a part of the timeout,
+    so the sender drives on.
+    """
+    timeout = _timeout(plan, driver)
+    driver |= {"way": dice.choice(("rmw", "rmw", "signed", "header", "zenoh")), "drift": 0.0}
+    driver["ahead"] = round(dice.uniform(-0.4, 0.0), 3)
+    even, at, offset = dice.random() < 0.5, dice.uniform(4.0, 10.0), 0.0
+    while at < plan["seconds"] - 4.0:
+        by = dice.choice((-1, 1)) * dice.choice((0.1, 0.2, 0.3, 0.5, 1.0, 3.0))
+        if even:
+            by = dice.uniform(-0.5, 0.3) * timeout - offset
+        rate = 0.001 * 80.0 ** dice.random()
+        lasts = min(abs(by) / rate, 40.0)
+        rate = math.copysign(rate, by)
+        offset += rate * lasts
+        driver["clock"].append(["slew", round(at, 3), round(at + lasts, 3), round(rate, 6)])
+        at += lasts + dice.uniform(1.0, 15.0)
+    if even:
+        driver["even"] = True
+
+
+def publishers(plan: Plan, dice: random.Random, driver: Sender) -> None:
+    """Let up to 20 programs come and go on the source of one that waits behind a queue.
+
+    The daemon knows its clock from before the queue. At the end one more program comes, which is
+    prompt, and drives.
+    """
+    timeout = _timeout(plan, driver)
+    begin = dice.uniform(6.0, 9.0) + max(0.0, timeout - 3.0)
+    plan["seconds"] = max(plan["seconds"], 60.0 + 2.0 * max(0.0, timeout - 3.0))
+    late = round(timeout + dice.choice((0.3, 1.0, 3.0, 8.0)), 3)
+    driver |= {
+        "way": dice.choice(("rmw", "rmw", "signed")), "refused": True, "hz": 20.0,
+        "phases": _stop_and_go(plan, dice, 0.0),
+        "congestion": [[round(begin, 3), plan["seconds"] + 1.0, "jump", late]],
+    }  # fmt: skip
+    usual = driver | {"congestion": [], "hz": dice.choice((20.0, 50.0))}
+    del usual["refused"]
+    at = begin + dice.uniform(2.0, 4.0)
+
+    def add(at: float, end: float, phases: list[list[Any]]) -> dict[str, Any]:
+        number = len(plan["senders"])
+        own = {
+            "name": f"s{number}", "id": f"s{number}/{dice.getrandbits(64):016x}",
+            "from": round(at, 3), "to": round(end, 3), "phases": phases,
+            "way": dice.choice(("rmw", "rmw", "signed")),
+        }  # fmt: skip
+        program: Sender = usual | own
+        plan["senders"].append(program)
+        return program
+
+    # In most plans, all are there for long enough to have their clocks proven.
+    longer = dice.choice(((timeout,), (timeout,), (0.0, timeout)))
+    for _ in range(dice.choice((8, 15, 17, 20, 20))):
+        zeros = dice.choice((0.1, 0.4, 0.8, 5.0))
+        add(at, at + dice.uniform(0.4, 1.5) + dice.choice(longer), [
+            [round(at, 3), 0.0, 0.0], [round(at + zeros, 3), *speeds(dice)],
+        ])  # fmt: skip
+        at += dice.uniform(0.3, 1.2)
+    at += 2.0 + timeout
+    phases: list[list[Any]] = []
+    last = add(at, plan["seconds"], phases)
+    last["even"] = True
+    while at < plan["seconds"]:
+        phases += [[round(at, 3), 0.0, 0.0], [round(at + 2.5, 3), *speeds(dice)]]
+        at += dice.uniform(6.0, 9.0)
+
+
+def _timeout(plan: Plan, sender: Sender) -> float:
+    sources = plan["config"]["commands"]["sources"]
+    (timeout,) = (s["timeout"] for s in sources if s["name"] == sender["source"])
+    return float(timeout)
 
 
 def _drive(dice: random.Random, at: float) -> list[list[Any]]:

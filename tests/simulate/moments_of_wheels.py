@@ -1,4 +1,4 @@
-"""Adds boards whose wheels, counts or speeds are wrong to some plans, mostly at low speeds.
+"""Adds boards whose wheels, counts or speeds are wrong to some plans, and links that flicker.
 
 `bad_moments.py` says what a moment is.
 """
@@ -44,13 +44,107 @@ def slow_wheels(plan: Plan, dice: random.Random, driver: Sender) -> None:
             events.append(event)
         phases.append([round(at, 3), 0.0, 0.0])
         at += dice.uniform(3.0, 4.0)
-        events.append({
-            "at": round(at, 4), "do": "call", "verb": "clear", "named": True, "late": 0.01,
-            "lost": False, "twice": False, "by": "op9", "via": "native",
-        })  # fmt: skip
+        events.append(_named_clear(at))
         at += 0.5
     driver |= {"phases": phases}
     plan["events"] = events
+
+
+def to_and_fro(plan: Plan, dice: random.Random, driver: Sender) -> None:
+    """Move the stick to and fro between two wishes, mostly while motors keep their speed.
+
+    A part of the links flickers meanwhile.
+    """
+    config = plan["config"]
+    _make_brisk(dice, config)
+    phases: list[list[Any]] = []
+    at = 0.0
+    while at < plan["seconds"] - 8.0:
+        v = round(dice.choice((-1, 1)) * dice.uniform(0.2, 1.0), 3)
+        w = dice.choice((0.0, 0.0, round(dice.uniform(-0.5, 0.5), 3)))
+        phases += [[round(at, 3), 0.0, 0.0], [round(at + 1.3, 3), v, w]]
+        begin = at + 1.3 + 1.5 + dice.uniform(0.0, 1.0)
+        lasts = dice.uniform(6.0, 20.0)
+        at = begin + lasts
+        phases += _swings(dice, v, w, begin, at)
+        if dice.random() < 0.7:
+            for motor in _motors(config, dice.choice(("all", "all", "side", "one")), dice):
+                plan["events"].append({
+                    "at": round(begin, 3), "do": "board", "for": round(lasts, 3),
+                    "fault": ["runaway", motor],
+                })  # fmt: skip
+        if dice.random() < 0.3:
+            plan["events"] += _flickers(dice, begin, at)
+        phases.append([round(at, 3), 0.0, 0.0])
+        at += dice.uniform(3.0, 4.0)
+        plan["events"].append(_named_clear(at))
+        at += 0.5
+    driver["phases"] = phases
+
+
+def flickering(plan: Plan, dice: random.Random, driver: Sender) -> None:
+    """Let the board fall silent for 0.1 to 0.3 s, again and again for some seconds."""
+    at = 3.0
+    while at < plan["seconds"] - 3.0:
+        end = min(at + dice.uniform(2.0, 8.0), plan["seconds"] - 1.0)
+        plan["events"] += _flickers(dice, at, end)
+        at = end + dice.uniform(2.0, 8.0)
+
+
+def _flickers(dice: random.Random, begin: float, end: float) -> list[dict[str, Any]]:
+    """Return silences of the board between these times: 0.1 to 0.3 s each 0.3 to 1 s."""
+    events, at = [], begin
+    every, silent = dice.uniform(0.3, 1.0), dice.uniform(0.1, 0.3)
+    silent = min(silent, every - 0.1)
+    while at + silent < end:
+        lasts = round(silent * dice.uniform(0.9, 1.1), 3)
+        events.append({"at": round(at, 3), "do": "board", "for": lasts, "fault": ["mute"]})
+        at += every * dice.uniform(0.95, 1.05)
+    return events
+
+
+def _swings(dice: random.Random, v: float, w: float, begin: float, end: float) -> list[list[Any]]:
+    """Return phases that go from these speeds to another wish and back, or rest all the time."""
+    share, other = dice.uniform(0.3, 0.7), dice.choice((-1.0, -1.0, 0.0, 0.0, 0.4))
+    period = 0.2 * 15.0 ** dice.random()  # 0.2 to 3 s, evenly by its logarithm
+    if dice.random() < 0.1:
+        return [[round(begin, 3), 0.0, 0.0]]
+    phases: list[list[Any]] = []
+    at = begin
+    while at + period < end:
+        phases += [
+            [round(at, 3), round(other * v, 3), round(other * w, 3)],
+            [round(at + period * (1.0 - share), 3), v, w],
+        ]
+        at += period
+    return phases
+
+
+def _make_brisk(dice: random.Random, config: dict[str, Any]) -> None:
+    """Let the limits allow 1 m/s, and speeds that follow a stick."""
+    config.get("odometry", {}).pop("gyro", None)
+    for name in ("wheel_speed", "response_time"):
+        config.get("feedback", {}).pop(name, None)
+    radius = round(dice.choice((0.04, 0.075, 0.15)) * dice.uniform(0.9, 1.1), 3)
+    config["drive"] = config.get("drive", {}) | {"wheel_radius": radius}
+    limits, down = config["limits"], round(dice.uniform(1.5, 4.0), 2)
+    for name in ("linear_jerk", "angular_jerk"):
+        limits.pop(name, None)
+    limits |= {
+        "linear_speed": 1.2, "angular_speed": 3.0, "wheel_speed": round(1.8 / radius, 2),
+        "linear_acceleration": round(dice.uniform(1.5, 4.0), 2), "angular_acceleration": 12.0,
+        "linear_deceleration": down, "linear_stop_deceleration": round(1.3 * down, 3),
+        "angular_deceleration": 12.0, "angular_stop_deceleration": 20.0,
+    }  # fmt: skip
+    motors_s = config["sim"]["motor_time_constant"]
+    config["sim"]["motor_time_constant"] = min(motors_s, 0.2)
+
+
+def _named_clear(at: float) -> dict[str, Any]:
+    return {
+        "at": round(at, 4), "do": "call", "verb": "clear", "named": True, "late": 0.01,
+        "lost": False, "twice": False, "by": "op9", "via": "native",
+    }  # fmt: skip
 
 
 def slow_speeds(dice: random.Random, config: dict[str, Any]) -> list[float]:
@@ -106,10 +200,7 @@ def stuck_encoder(plan: Plan, dice: random.Random, driver: Sender) -> None:
         })  # fmt: skip
         phases.append([round(at, 3), 0.0, 0.0])
         at += dice.uniform(3.0, 4.0)
-        events.append({
-            "at": round(at, 4), "do": "call", "verb": "clear", "named": True, "late": 0.01,
-            "lost": False, "twice": False, "by": "op9", "via": "native",
-        })  # fmt: skip
+        events.append(_named_clear(at))
         at += 0.5
     driver |= {"phases": phases}
     plan["events"] = events

@@ -240,13 +240,13 @@ def again(faults: list[Fault], jobs: int) -> int:
     rows = read()
     recorded = [(fault, rows[fault.name]) for fault in faults if rows.get(fault.name)]
     recorded = [(fault, row) for fault, row in recorded if row.seed]
-    with ThreadPoolExecutor(jobs) as pool:
-        reasons = list(pool.map(lambda pair: broken_again(*pair), recorded))
     lost = 0
-    for (fault, row), reason in zip(recorded, reasons, strict=True):
-        if reason:
-            lost += 1
-            print(f"{fault.name}: seed {row.seed} {reason}")
+    with ThreadPoolExecutor(jobs) as pool:
+        reasons = pool.map(lambda pair: broken_again(*pair), recorded)
+        for (fault, row), reason in zip(recorded, reasons, strict=True):
+            if reason:
+                lost += 1
+                print(f"{fault.name}: seed {row.seed} {reason}", flush=True)
     print(f"{len(recorded) - lost} of {len(recorded)} rows hold")
     return lost
 

@@ -38,6 +38,8 @@ PLANS_OF_FAULT = {
     "limits clock": "wall",
     "robot unsent": "block", "robot limits": "limits", "lifecycle number": "typed",
     "lifecycle fault": "driver_fault", "ages echo": "queue from the start",
+    "ages full": "short-lived publishers", "ages rise": "clock that is slewed",
+    "neutral flicker": "dropouts",
     "gyro hangs": "hangs", "odometry still": "mute", "arbiter silence": "long silence",
     "two": "two wheels",
 }  # fmt: skip
@@ -177,6 +179,15 @@ FAULTS = (
           "elif at_ns - self.since_ns >= timeout_ns:", "elif at_ns > self.since_ns:"),
     fault("ages silence", "a sender stays armed through any silence", NEUTRAL,
           "now_ns - self.arrived_ns > SILENT_NS", "now_ns - self.arrived_ns > 10**15"),
+    fault("ages full", "a full table of clocks forgets one that it refuses", AGES,
+          "return not self.late or now_ns - self.at_ns > MEMORY_NS", "return True",
+          Edit(AGES, "(sound[n].least is not None,",
+          "(not sound[n].late, sound[n].least is not None,")),
+    fault("ages rise", "the least delay of a clock rises by 5 % of the time, and without a bound",
+          AGES, "RISE_DIVISOR = 2000", "RISE_DIVISOR = 20",
+          Edit(AGES, "max(self.least, min(risen, min(self.lows) + timeout_ns))", "risen")),
+    fault("neutral flicker", "a board that was silent for 0.12 s asks each sender for a zero",
+          SESSION, "LONG_GAP_NS = 1 * NS_PER_S", "LONG_GAP_NS = 12 * NS_PER_S // 100"),
     fault("neutral anywhere", "a pause arms a sender of each source", ARBITER,
           "        if pauses:\n            sender.find_gap(command)\n",
           "        if True:\n            sender.find_gap(command)\n"),
@@ -389,8 +400,9 @@ FAULTS = (
     # odometry
     fault("odometry turn", "the pose turns the wrong way", KINEMATICS,
           "(right - left) / self.track", "(left - right) / self.track"),
-    fault("odometry yaw", "the pose turns by a fifth too much", KINEMATICS,
-          "heading, end = yaw + half, yaw + turn", "heading, end = yaw + half, yaw + 1.2 * turn"),
+    # The simulated robot moves by the same `on_arc`, so the fault is where the odometry calls it.
+    fault("odometry yaw", "the pose turns by a fifth too much", ODOMETRY,
+          "on_arc(pose.yaw, way, turned)", "on_arc(pose.yaw, way, 1.2 * turned)"),
     fault("odometry set", "set_pose takes x for y", ODOMETRY,
           "self.pose = Pose(pose.x, pose.y, math", "self.pose = Pose(pose.y, pose.x, math"),
     fault("odometry gap", "a gap while the robot moves does not make the pose less certain",
@@ -409,7 +421,9 @@ FAULTS = (
     fault("odometry endless", "the covariance of a robot that has stood for 3 s is infinite",
           ODOMETRY, "        at_rest = self.rested > REST_S\n",
           "        at_rest = self.rested > REST_S\n" "        if self.rested > 3.0:\n"
-          "            self.uncertainty.doubt(math.inf, math.inf, 0.0, 0.0)\n"),
+          "            p = self.uncertainty.covariance\n"
+          "            p = type(p)(math.inf, p.xy, p.xyaw, p.yy, p.yyaw, p.yawyaw)\n"
+          "            self.uncertainty.covariance = p\n"),
     fault("odometry leap", "a lost line moves the pose by 2 m", ODOMETRY,
           "            self.filled += filled\n", "            self.filled += filled\n"
           "            self.pose = Pose(self.pose.x + 2.0, self.pose.y, self.pose.yaw)\n"),

@@ -131,12 +131,9 @@ class Disk(Keeper):
         self._running = True
         self._written = self.latches
         """The latches in the file."""
+        self.behind = False
+        """The disk was full when the daemon last wrote, so the file lacks the newest latches."""
         self._data = encode("acsar", self._written)
-
-    @property
-    def behind(self) -> bool:
-        """Whether the file lacks the newest latches."""
-        return self._written != self.latches
 
     def fill(self, full: bool) -> None:
         """Fill the disk, so that nothing can be written, or make space again.
@@ -150,6 +147,7 @@ class Disk(Keeper):
     def keep(self, latches: Latches) -> None:
         self.latches = latches
         self.trouble = unwritable("FILE", "no space left on device") if self.full else ""
+        self.behind = self.full and self._written != latches
         if not self.full:
             self._data, self._written = encode("acsar", latches), latches
 
@@ -184,6 +182,7 @@ class Disk(Keeper):
         if self.full:
             self.trouble = unwritable("FILE", "no space left on device")
             self.latches = not_writable(latches, "FILE", "no space left on device", now)
+        self.behind = self.full
         return self.latches
 
 
@@ -237,6 +236,8 @@ class Product:
         """The first bytes of a reply with speeds."""
         self._faults: list[tuple[str, tuple[Any, ...]]] = []
         self._lasting = ExitStack()
+        self._kept: dict[int, float] = {}
+        """The set points of the motors that run away, by the place of their wheels."""
         self.disk = Disk()
         self.alive = True
         self.fed: Callable[[int, bytes], None] = lambda at_ns, data: None
@@ -500,9 +501,10 @@ class Product:
 
     def _run_away(self, mcu: FakeMcu, motors: list[int]) -> None:
         """Let these motors keep their set points, whatever the board commands."""
-        vehicle = mcu.vehicle
+        vehicle, before = mcu.vehicle, self._kept
         places = [place for motor in motors for place in mcu._wiring[motor][0]]
-        kept = {place: vehicle.set_points[place] for place in places}
+        kept = {place: before.get(place) or vehicle.set_points[place] for place in places}
+        self._kept = kept
 
         def advance(dt: float, push: float | None = None) -> None:
             for place, speed in kept.items():
@@ -595,6 +597,10 @@ class Product:
     def wheels(self) -> list[float]:
         """Return the true speeds of the wheels, rad/s, in the order of the configuration."""
         return list(self._world.mcu.vehicle.speeds)
+
+    def angles(self) -> list[float]:
+        """Return the true angles of the wheels, rad, in the same order."""
+        return list(self._world.mcu.vehicle.angles)
 
     @property
     def plugged(self) -> bool:

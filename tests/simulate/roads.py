@@ -178,6 +178,11 @@ def _ahead(sender: dict[str, Any], t: float) -> float:
     return float(ahead)
 
 
+def is_slewed(sender: dict[str, Any], t: float) -> bool:
+    """Return whether the clock of this sender is slewed at `t`."""
+    return any(kind == "slew" and at <= t < rest[0] for kind, at, *rest in sender["clock"])
+
+
 def stable(sender: dict[str, Any]) -> bool:
     """Return whether nothing adjusts this sender's clock, and all its stamps are true."""
     return not sender["clock"] and not sender.get("bad_stamps")

@@ -79,13 +79,13 @@ def large(plan: Plan) -> list[Part]:
 
 
 def small(plan: Plan) -> list[Part]:
-    """Return the paths of the phases, congestions and clock changes of all senders."""
-    lists = ("phases", "congestion", "clock")
+    """Return the paths of the phases, congestions, clock changes and losses of all senders."""
+    lists = ("phases", "congestion", "clock", "away")
     return [
         ("senders", n, name, place)
         for n, sender in enumerate(plan["senders"])
         for name in lists
-        for place in range(len(sender[name]))
+        for place in range(len(sender.get(name, ())))
     ]
 
 

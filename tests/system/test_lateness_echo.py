@@ -2,19 +2,16 @@
 
 from __future__ import annotations
 
-import queue
-import socket
 import sys
-import threading
 import time
 from collections.abc import Iterator
-from contextlib import suppress
 from pathlib import Path
 
 import pytest
 
 from tests.system.bystander import lost
 from tests.system.harness import Bus, Daemon, Program, until
+from tests.system.relay import Relay
 
 pytestmark = pytest.mark.network
 
@@ -38,75 +35,13 @@ with connect(sys.argv[1]) as robot:
 """
 
 
-class Delay:
-    """A TCP relay to the daemon, in which the bytes of a client wait."""
-
-    def __init__(self, endpoint: str) -> None:
-        self.seconds = 0.0
-        """How long each byte waits."""
-        self.open = threading.Event()
-        """Clear in a partition: then all bytes wait until it heals."""
-        self.open.set()
-        self._target = ("127.0.0.1", int(endpoint.rpartition(":")[2]))
-        self._sockets = [socket.create_server(("127.0.0.1", 0))]
-        self.endpoint = f"tcp/127.0.0.1:{self._sockets[0].getsockname()[1]}"
-
-    def __enter__(self) -> Delay:
-        threading.Thread(target=self._accept, daemon=True).start()
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        for sock in self._sockets:
-            with suppress(OSError):  # closed by the other side
-                sock.shutdown(socket.SHUT_RDWR)
-            sock.close()
-
-    def _accept(self) -> None:
-        with suppress(OSError):  # closed
-            while True:
-                client, daemon = (
-                    self._sockets[0].accept()[0],
-                    socket.create_connection(self._target),
-                )
-                self._sockets += [client, daemon]
-                waiting = queue.SimpleQueue[tuple[float, bytes]]()
-                for work, words in (
-                    (self._take, (client, waiting)),
-                    (self._give, (waiting, daemon)),
-                    (self._pass, (daemon, client)),
-                ):
-                    threading.Thread(target=work, args=words, daemon=True).start()
-
-    def _take(self, source: socket.socket, waiting: queue.SimpleQueue[tuple[float, bytes]]) -> None:
-        data = b"-"
-        while data:
-            with suppress(OSError):
-                data = b""
-                data = source.recv(65536)
-            waiting.put((time.monotonic() + self.seconds, data))
-
-    def _give(self, waiting: queue.SimpleQueue[tuple[float, bytes]], sink: socket.socket) -> None:
-        data = b"-"
-        while data:
-            due, data = waiting.get()
-            time.sleep(max(0.0, due - time.monotonic()))
-            self.open.wait()
-            with suppress(OSError):
-                sink.sendall(data)
-
-    def _pass(self, source: socket.socket, sink: socket.socket) -> None:
-        with suppress(OSError):
-            while data := source.recv(65536):
-                sink.sendall(data)
-
-
 @pytest.fixture
-def delay(shared: Daemon) -> Iterator[Delay]:
-    with Delay(shared.endpoint) as delay:
+def delay(shared: Daemon) -> Iterator[Relay]:
+    with Relay(shared.endpoint) as delay:
         yield delay
 
 
-def joystick(delay: Delay, where: Path, seconds: int, held: int) -> Program:
+def joystick(delay: Relay, where: Path, seconds: int, held: int) -> Program:
     words = [sys.executable, "-c", JOYSTICK, delay.endpoint, str(seconds), str(held)]
     return Program(words, where)
 
@@ -119,7 +54,7 @@ def test_a_new_client_drives_within_0_3_s_of_its_zero(
     with (
         bus.follow("cmd/app") as sent,
         bus.follow("cmd_vel_out") as applied,
-        Delay(shared.endpoint) as delay,
+        Relay(shared.endpoint) as delay,
         joystick(delay, tmp_path, 1, 1) as client,
     ):
         assert client.ended(20.0) == 0, client
@@ -132,7 +67,7 @@ def test_a_new_client_drives_within_0_3_s_of_its_zero(
 
 @pytest.mark.parametrize("fault", ["a queue", "a partition that heals"])
 def test_a_robot_whose_client_falls_behind_stops_in_time_and_obeys_nothing_that_waited(
-    bus: Bus, delay: Delay, tmp_path: Path, fault: str
+    bus: Bus, delay: Relay, tmp_path: Path, fault: str
 ) -> None:
     bus.at_rest()
     (tmp_path / "begin").touch()
