@@ -118,7 +118,7 @@ class Clock(Struct):
             verdict = "stale" if delay - least > timeout_ns else ""
             if not verdict:  # a late command of another program is no evidence against a proof
                 self.since_ns = None
-        self.late = self.late or (verdict == "stale" and least is not None)
+        self.late = self.late or verdict == "stale"
         if still:
             verdict, self.advance = "stamps", 0.0
         elif not verdict and stamp_ns <= self.accepted_ns:
