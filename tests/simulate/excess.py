@@ -17,9 +17,9 @@ from tests.simulate.roads import NS
 JUDGED = True
 """Whether such a wheel breaks the promise, or is only counted."""
 
-MOST_M = 2.0
+MOST_M = 2.5
 
-MEAN_NS, DIFFERS = 5 * NS, 0.3
+MEAN_NS, DIFFERS = 5 * NS, 0.5
 """Time of both means, and the share of the commanded one by which they certainly differ."""
 
 Ways = tuple[float, float]

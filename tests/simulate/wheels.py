@@ -1,8 +1,8 @@
 """The promise that a wheel which does not obey its command is found, at every speed.
 
 The judge knows the true speed of each wheel. A wheel that turns against its command, or on after a
-stop, must be a latched fault before it has rolled 1 rad and 3 encoder counts. Before that, the
-command must have been constant for three response times. A robot that drives 20 % faster than any
+stop, must be a latched fault before it has rolled `FACTOR` times 1 rad, 3 encoder counts and the
+way in 0.2 s. Before that, the command must have been constant for 0.6 s and three response times. A robot that drives 20 % faster than any
 command of that time must be stopped, too. `state` must name a wheel that does not turn.
 """
 
@@ -24,6 +24,8 @@ MOTORS = {"reversed_motor", "swapped_motors", "runaway"}
 
 ROLL_RAD, ROLL_COUNTS = 1.0, 3
 """A wheel that disobeys is found within the greater of both."""
+
+FACTOR, TIMING_S, DEAD_TIME_NS = 2.6, 0.2, 3 * NS // 5
 
 ROOM_RAD, ROOM_NS = 0.2, 3 * NS // 20
 """Allowed beside these bounds: the way of a line, and the window of the board's speeds."""
@@ -51,7 +53,7 @@ class Wheels:
         counts = config.get("sim", {}).get("encoder_counts", 3200)
         response_s = config.get("feedback", {}).get("response_time", 0.2)
         lag_s = config.get("sim", {}).get("motor_time_constant", 0.1)
-        self._response_ns = int(3 * max(response_s, lag_s) * NS)
+        self._response_ns = max(DEAD_TIME_NS, int(3 * max(response_s, lag_s) * NS))
         self._roll = max(ROLL_RAD, ROLL_COUNTS * math.tau / counts)
         self._step_ns = 0
         self._commands = [0.0] * 4
@@ -107,7 +109,8 @@ class Wheels:
                 continue
             self._rolled[place] += abs(speed) * passed_ns / NS
             witness.counts["wheels against"] += 1
-            most = self._roll + ROOM_RAD + abs(speed) * ROOM_NS / NS
+            most = FACTOR * (self._roll + TIMING_S * abs(speed))
+            most += ROOM_RAD + abs(speed) * ROOM_NS / NS
             if self._rolled[place] > most:
                 text = f"wheel {place} turns at {speed:.2f} rad/s for {command:.2f} rad/s"
                 text += f", and has rolled {self._rolled[place]:.2f} rad"
