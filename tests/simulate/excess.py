@@ -14,9 +14,6 @@ from collections.abc import Sequence
 from tests.simulate.promises import BrokenError, Witness
 from tests.simulate.roads import NS
 
-JUDGED = True
-"""Whether such a wheel breaks the promise, or is only counted."""
-
 MOST_M = 2.5
 
 MEAN_NS, DIFFERS = 5 * NS, 0.5
@@ -90,7 +87,7 @@ class Excess:
             witness.counts["largest excess mm"] = max(
                 witness.counts["largest excess mm"], int(1000 * metres)
             )
-            if JUDGED and metres > MOST_M:
+            if metres > MOST_M:
                 text = f"wheel {place} has rolled {metres:.2f} m more or less than commanded"
                 raise BrokenError("a wheel that does not obey is found", at_ns, text)
 

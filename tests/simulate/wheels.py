@@ -2,8 +2,9 @@
 
 The judge knows the true speed of each wheel. A wheel that turns against its command, or on after a
 stop, must be a latched fault before it has rolled `FACTOR` times 1 rad, 3 encoder counts and the
-way in 0.2 s. Before that, the command must have been constant for 0.6 s and three response times. A robot that drives 20 % faster than any
-command of that time must be stopped, too. `state` must name a wheel that does not turn.
+way in 0.2 s. Before that, the command must have been constant for 0.6 s and three response times. A
+robot that drives 20 % faster than any command of that time must be stopped, too. `state` must name
+a wheel that does not turn.
 """
 
 from __future__ import annotations
