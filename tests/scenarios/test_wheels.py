@@ -290,6 +290,22 @@ def test_encoders_that_die_all_at_once_stop_the_robot_within_a_second_by_one_fau
 
 
 @four_and_two
+def test_encoders_that_die_under_a_stick_that_moves_to_and_fro_stop_the_robot(
+    wheels: WheelMap,
+) -> None:
+    """Neither a change of the command nor its end is evidence that a wheel moved."""
+    world = World(Config(mcu=McuConfig(wheels=wheels)))
+    world.drive(0.5, seconds=2.0)
+    way = world.mcu.vehicle.pose.x
+    with world.mcu.switched(partial(replace, gains=(0.0,) * len(wheels.letters))):
+        for _ in range(20):
+            world.hold(0.5, seconds=0.5)
+            world.hold(-0.2, seconds=0.5)
+        assert world.state.code in ("neutral", "no_wheel_moves")
+    assert world.mcu.vehicle.pose.x - way < 2.0
+
+
+@four_and_two
 def test_motors_that_do_not_turn_wait_for_a_zero_and_the_third_time_for_a_clear(
     wheels: WheelMap,
 ) -> None:

@@ -21,10 +21,11 @@ DEAD_TIME_S = 0.6
 AGREEMENT = 0.3  # fraction of a speed by which a sound wheel may differ
 # Noise of a smoothed speed, in counts in the time in which it is smoothed, and at most this many
 # times the speed that is due: a wheel that ought to stand shows none.
-NOISE_COUNTS, NOISE = 0.7, 10.0
+NOISE_COUNTS, MAX_NOISE_RATIO = 0.7, 10.0
 REACTION = 2.0  # weight of the change of a wheel in one time of `DELAYS` delays
 LEAK_S = 10.0  # while a hypothesis explains the motion
-MOST = 1.5  # largest fraction of the evidence for a fault that is kept: more delays the next one
+# Largest fraction of the evidence for a fault that is kept: a wheel that obeys again is sound soon.
+MAX_EVIDENCE = 1.5
 
 
 def _zeros() -> list[float]:
@@ -47,7 +48,7 @@ class Expected(Struct):
         return max(max(self.high), -min(self.low))
 
     def in_direction_of(self, speed: RadPerS) -> RadPerS:
-        """The largest speed that was due in the direction of another one, or against it."""
+        """Return the largest speed due in this direction; below 0 if only the opposite was."""
         return max(self.high) if speed > 0.0 else -min(self.low)
 
     def add(self, *speeds: RadPerS) -> None:
@@ -63,7 +64,7 @@ class Expected(Struct):
         for low, high in zip(self.low, self.high, strict=True):
             slow = low if low > 0.0 else -high if high < 0.0 else 0.0
             fast = low + high if low + high > 0.0 else -low - high
-            unsure = NOISE * (high if high > -low else -low)
+            unsure = MAX_NOISE_RATIO * (high if high > -low else -low)
             if noise < unsure:
                 unsure = noise
             low -= AGREEMENT * (low if low > 0.0 else -low) + unsure
@@ -92,7 +93,7 @@ class Obedience(Struct):
 
     def add(self, speed: RadPerS, bounds: list[Bounds], s: Seconds, limit: Rad) -> None:
         """Add the smoothed speed of `s` seconds. `limit` is the evidence for a fault."""
-        speeds, most, keep = self.speeds, MOST * limit, 1.0 - s / LEAK_S
+        speeds, most, keep = self.speeds, MAX_EVIDENCE * limit, 1.0 - s / LEAK_S
         speeds.insert(0, speed)
         change = REACTION * (speed - speeds.pop())
         turns = speed
@@ -103,7 +104,9 @@ class Obedience(Struct):
             self.astray, self.fast, self.slow, bounds, strict=True
         ):
             beyond = speed - high if speed > 0.0 else low - speed
-            if beyond > 0.0 and turns:
+            if beyond > 0.0:
+                # A wheel that turns too little has rolled nothing too far.
+                beyond = beyond if beyond < turns else turns
                 # Away from what is due, a change counts as much as what is beyond it.
                 was += (beyond + (change if change < beyond else beyond)) * s
             else:

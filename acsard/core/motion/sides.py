@@ -59,9 +59,9 @@ class Side(Struct):
     expected: RadPerS = 0.0  # behind the whole response time
     halfway: RadPerS = 0.0  # behind half of it
     due: Expected = field(default_factory=Expected)
-    told: Rad = 0.0  # commanded since the last step, and the same behind the lags
-    told_whole: Rad = 0.0
-    told_half: Rad = 0.0
+    angle: Rad = 0.0  # commanded since the last step, and the same behind the lags
+    half_angle: Rad = 0.0
+    whole_angle: Rad = 0.0
     smooth: tuple[RadPerS, RadPerS, RadPerS] = (0.0, 0.0, 0.0)  # the mean speeds of these
     difference: Rad = 0.0  # recent sum of front minus rear
     rolled: Rad = 0.0  # recent sum of the magnitudes
@@ -88,21 +88,21 @@ class Side(Struct):
         """Add what a wheel that follows the command behind a lag rolls in a block."""
         # Exact for a command that is constant in the block; the mean of two is, in a ramp.
         goal, self.command = (self.command + command) / 2, command
-        self.told += goal * s
+        self.angle += goal * s
         self.expected, angle = _lagged(self.expected, goal, s, lag)
-        self.told_whole += angle
+        self.whole_angle += angle
         self.halfway, angle = _lagged(self.halfway, goal, s, lag / 2)
-        self.told_half += angle
+        self.half_angle += angle
 
     def remember(self, s: Seconds, share: float) -> None:
         """End a step of `s` seconds, and smooth its speeds as the measured ones are."""
-        told, half, whole = self.smooth
-        told += (self.told - told * s) * share
-        half += (self.told_half - half * s) * share
-        whole += (self.told_whole - whole * s) * share
-        self.smooth = told, half, whole
-        self.due.add(told, half, whole)
-        self.told = self.told_half = self.told_whole = 0.0
+        command, half, whole = self.smooth
+        command += (self.angle - command * s) * share
+        half += (self.half_angle - half * s) * share
+        whole += (self.whole_angle - whole * s) * share
+        self.smooth = command, half, whole
+        self.due.add(command, half, whole)
+        self.angle = self.half_angle = self.whole_angle = 0.0
 
     def begin(self, speed: RadPerS) -> None:
         """Expect that a wheel of this speed slows down."""

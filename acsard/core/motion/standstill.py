@@ -19,19 +19,19 @@ from acsard.core.values import Rad, RadPerS, Seconds
 # without power slow down. Slower commands may be too slow for the motors.
 TURNS, AT_ONCE_S, SUDDEN_S = 2.0, 0.1, 1.0
 
-SAID_S, SAID_ANGLE = 1.0, 1.0  # commanded in vain, both of them, until it is a warning
+REPORT_S, REPORT_ANGLE = 1.0, 1.0  # commanded in vain, both of them, until it is a warning
 BEGIN_S, TRIES, TRIES_S = 3.0, 3, 60.0
 
 COMMANDED = 0.005  # rad/s: a line to the board shows a lower one as 0.00
 
-Verdict = Literal["", "said", "given up", "fault"]
+Verdict = Literal["", "reported", "given up", "fault"]
 
 
 class Standstill(Struct):
     all_turned: bool = False  # at `TURNS` at least, until `AT_ONCE_S` before the last motion
     slow_s: Seconds = 0.0  # with any motion since then
-    none_s: Seconds = 0.0  # without any, while all are commanded
-    none_angle: Rad = 0.0  # the least that was commanded meanwhile
+    none_s: Seconds = 0.0  # without any, while a side is commanded
+    none_angle: Rad = 0.0  # the most that was commanded meanwhile
     fast_s: Seconds = 0.0  # of it, with commands of `TURNS` at least
     why: Reason | None = None  # until a wheel turns
     tries: int = 0
@@ -44,7 +44,7 @@ class Standstill(Struct):
         self, angles: list[Rad], commands: tuple[RadPerS, RadPerS], s: Seconds, count: Rad
     ) -> Verdict:
         """Add a block: the angles of the wheels, and the commands of the left and right side."""
-        turned, command = [abs(angle) for angle in angles], min(map(abs, commands))
+        turned, command = [abs(angle) for angle in angles], max(map(abs, commands))
         if self.tries:
             self.tries_s += s
             if self.tries_s > TRIES_S:
@@ -58,31 +58,33 @@ class Standstill(Struct):
             self.none_s = self.none_angle = self.fast_s = 0.0
             self.why = None
             return ""
+        # A command that is small, or ends, is no evidence: only motion is.
+        self.all_turned = self.all_turned and command >= TURNS
         if command < COMMANDED:
-            self.forget()
             return ""
         self.none_s += s
         self.none_angle += command * s
-        before, self.fast_s = self.fast_s, self.fast_s + s if command >= TURNS else 0.0
+        if command >= TURNS:
+            self.fast_s += s
         if self.all_turned:
-            if not self.fast_s:
-                self.all_turned = False
-            elif before < SUDDEN_S <= self.fast_s:
-                self.why = _why("no_wheel_moves", commands, SUDDEN_S)
-                return "fault"
-            return ""
-        if before < BEGIN_S <= self.fast_s:
+            if self.fast_s < SUDDEN_S:
+                return ""
+            self.why = _why("no_wheel_moves", commands, SUDDEN_S)
+            self.all_turned, self.fast_s = False, 0.0
+            return "fault"
+        if self.fast_s >= BEGIN_S:
             if not self.tries:
                 self.tries_s = 0.0
             self.tries += 1
+            self.fast_s = 0.0
             self.why = _why("no_wheel_begins", commands, self.none_s)
             if self.tries < TRIES:
                 return "given up"
             self.tries = 0
             return "fault"
-        if self.why is None and self.none_s >= SAID_S and self.none_angle >= SAID_ANGLE + count:
+        if self.why is None and self.none_s >= REPORT_S and self.none_angle >= REPORT_ANGLE + count:
             self.why = _why("no_wheel_begins", commands, self.none_s)
-            return "said"
+            return "reported"
         return ""
 
 

@@ -70,7 +70,7 @@ LEAST_SPEED = 0.05  # m/s, of a runaway that must not look like rest
 
 # Times the largest output of the limiter, and rad and counts rolled beyond that, both of them: a
 # sound wheel shows up to a count more than it turned.
-TOO_FAST, TOO_FAST_S, TOO_FAST_ANGLE, TOO_FAST_COUNTS = 1.2, 1.0, 0.3, 1.5
+TOO_FAST, TOO_FAST_S, TOO_FAST_ANGLE, TOO_FAST_COUNTS = 1.2, 1.0, 0.3, 2.5
 ROUNDING = 0.006  # rad/s, of a reported speed
 JITTER_S = 0.004  # of the times of lines
 
@@ -94,7 +94,7 @@ class Wheel(Struct):
     agrees: bool = True
     obedience: Obedience = field(default_factory=Obedience)
     rolled: Rad = 0.0  # either way, while it is faster or slower than expected
-    told: Rad = 0.0  # what was due meanwhile
+    due: Rad = 0.0  # what was due meanwhile
     timing: Rad = 0.0  # by which a sound wheel may be earlier or later than expected
     missed: Rad = 0.0  # expected minus measured since both agreed
     rested: bool = True  # and was not commanded since then
@@ -276,7 +276,7 @@ class Wheels(Struct):
         for wheel in self.wheels:
             wheel.turned = 0.0
         for side in self.sides:
-            side.told = side.told_half = side.told_whole = 0.0
+            side.angle = side.half_angle = side.whole_angle = 0.0
 
     def _add(self, block: Block) -> None:
         s = block.s
@@ -297,17 +297,17 @@ class Wheels(Struct):
                 wheel.same_s += s
             else:
                 wheel.same_s, wheel.reported = 0.0, speed
-        self._find_none(block)
+        self._check_standstill(block)
 
     def _obey(self, count: Rad) -> None:
         s, fastest, least = self.step_s, 0.0, max(FAULT_ANGLE, FAULT_COUNTS * count)
         for side in self.sides:
-            size = max(abs(side.told) / s, *[abs(self.wheels[i].speed) for i in side.wheels])
+            size = max(abs(side.angle) / s, *[abs(self.wheels[i].speed) for i in side.wheels])
             smoothed = SMOOTHED_S
             if size * SMOOTHED_S > SMOOTHED_COUNTS * count:
                 smoothed = SMOOTHED_COUNTS * count / size
             share = 1.0 / (smoothed + s)
-            whole = side.told_whole
+            whole = side.whole_angle
             side.remember(s, share)
             noise = NOISE_COUNTS * count * share
             bounds = side.due.bounds(noise)
@@ -354,7 +354,7 @@ class Wheels(Struct):
         if wheel.doubted and more:
             self._doubt(i, more)
 
-    def _find_none(self, block: Block) -> None:
+    def _check_standstill(self, block: Block) -> None:
         left, right = self.sides
         angles, commands = list(block.angles[: len(self.wheels)]), (left.command, right.command)
         stood = self.standstill.why is not None
@@ -367,7 +367,7 @@ class Wheels(Struct):
             self.gives_up = verdict == "given up"
             if verdict == "fault":
                 self.fault = why
-            elif verdict == "said" or self.gives_up:
+            elif verdict == "reported" or self.gives_up:
                 self.events = (*self.events, _warning(why.text, why.code))
         elif stood and self.standstill.why is None:
             self.events = (*self.events, Event("wheel_fault", "a wheel turns again", kind="again"))
@@ -375,7 +375,7 @@ class Wheels(Struct):
     def _pace(self, i: int, wheel: Wheel, count: Rad) -> None:
         enough = max(TOO_FAST_ANGLE, TOO_FAST_COUNTS * count)
         fast = wheel.fast_s >= TOO_FAST_S and wheel.fast_angle >= enough
-        if fast and not self._are_swapped(i):
+        if fast and not self._latch_swapped(i):
             self._latch("wheel_too_fast", i, self.sides[SIDE_OF[i]].due.most)
         obedience = wheel.obedience
         if self.standstill.why is not None:
@@ -383,9 +383,9 @@ class Wheels(Struct):
         slow, beyond = min(obedience.slow), min(obedience.fast)
         if slow or beyond:
             wheel.rolled += abs(wheel.turned)
-            wheel.told += abs(wheel.expected) * self.step_s
+            wheel.due += abs(wheel.expected) * self.step_s
         else:
-            wheel.rolled = wheel.told = 0.0
+            wheel.rolled = wheel.due = 0.0
         if -COMMANDED < wheel.command < COMMANDED or self.standstill.none_s:
             return
         if beyond >= count + wheel.timing:
@@ -398,7 +398,7 @@ class Wheels(Struct):
 
     def _disobeys(self, i: int, wheel: Wheel) -> None:
         # One cause is enough: the robot stops.
-        if wheel.doubted or self._are_swapped(i):
+        if wheel.doubted or self._latch_swapped(i):
             return
         speed, command = wheel.speed, wheel.command
         due = self.sides[SIDE_OF[i]].due.in_direction_of(speed)
@@ -407,7 +407,7 @@ class Wheels(Struct):
         else:
             self._latch("wheel_runaway", i, command)
 
-    def _are_swapped(self, i: int) -> bool:
+    def _latch_swapped(self, i: int) -> bool:
         # Whether this wheel and the one across turn as commanded to each other.
         one, other = self.wheels[i], self.wheels[ACROSS[i]]
         command, expected = one.command - other.command, one.expected - other.expected
@@ -433,6 +433,7 @@ class Wheels(Struct):
         self.fault = joined(reason("wheels_swapped", part=names, wheels=names, figures=figures))
         for wheel in (one, other):
             wheel.obedience.forget()
+            wheel.fast_s = wheel.fast_angle = 0.0
         return True
 
     def _latch(self, code: Code, i: int, command: RadPerS) -> None:
@@ -548,5 +549,5 @@ def _warning(text: str, code: Code) -> Event:
 
 def _text(wheel: Wheel, name: str) -> str:
     assert wheel.warning is not None
-    share = wheel.rolled / wheel.told if wheel.told else 0.0
+    share = wheel.rolled / wheel.due if wheel.due else 0.0
     return joined(reason(wheel.warning, wheel=name, share=f"{share:.0%}")).text
