@@ -73,8 +73,8 @@ UNLATCHED = (Mode.DRIVING, Mode.READY)  # their reason depends only on the choic
 QUIET = News()
 
 PORT_LENT = (
-    "the serial port is closed; type `acsard call activate` to open it again. The pose is then "
-    "unknown until `acsard call reset_odometry` or `acsard call set_pose`"
+    "the serial port is closed; type `acsard call activate` to open it again. The robot may have "
+    "been pushed until then, so its pose is less certain: `acsard call set_pose` says where it is"
 )
 
 NOTHING_CHANGED = "nothing changed: all settings already have these values"
@@ -493,7 +493,6 @@ class Robot:
             case "activate":
                 if life.port_released:
                     life.port_released = False  # even if it is refused
-                    state.odometry.uncertainty.lose()
                 numbers = life.activate(request.numbers, asked_ns)
                 state.arbiter.forget_clocks()
                 state.arbiter.require_neutral(asked_ns)
@@ -504,7 +503,7 @@ class Robot:
                 message = life.deactivate(request.by, now)
                 return message, (life.latches.last,)
             case "set_pose" | "reset_odometry":
-                return self.place(request.pose or Pose()), ()
+                return self.place(request.pose or Pose(), now.mono_ns), ()
             case "set":
                 changes |= self._set(request.settings, now.mono_ns)
                 return describe_changes(changes) or NOTHING_CHANGED, ()
@@ -537,9 +536,9 @@ class Robot:
         speed = max(map(abs, state.odometry.speeds.as_tuple())) * self.model.kinematics.radius
         return not state.session.silent(now_ns) and speed > LEAST_SPEED
 
-    def place(self, pose: Pose) -> str:
+    def place(self, pose: Pose, at_ns: Ns) -> str:
         state = self.state
-        state.odometry.set_pose(pose, self.model)
+        state.odometry.set_pose(pose, self.model, at_ns)
         state.count("poses_set")
         state.checks.gyro.forget_doubt()
         pose = state.odometry.pose

@@ -390,8 +390,7 @@ FAULTS = (
     fault("odometry set", "set_pose takes x for y", ODOMETRY,
           "self.pose = Pose(pose.x, pose.y, math", "self.pose = Pose(pose.y, pose.x, math"),
     fault("odometry gap", "a gap while the robot moves does not make the pose less certain",
-          ODOMETRY, "            if gap and not (rested",
-          "            if gap and gap.seconds > 1e9 and not (rested"),
+          ODOMETRY, "            if gap:\n", "            if gap and gap.seconds > 1e9:\n"),
     fault("odometry vague", "the covariance of the pose is a hundred times as large as the errors",
         UNCERTAINTY, "        self.covariance = p if known else UNKNOWN_POSE\n",
         "        p = PoseCovariance(*(100.0 * getattr(p, name) for name in p.__struct_fields__))\n"
@@ -407,7 +406,7 @@ FAULTS = (
           "        at_rest = self.rested > REST_S\n" "        if self.rested > 3.0:\n"
           "            self.uncertainty.doubt(math.inf, math.inf, 0.0, 0.0)\n"),
     fault("odometry leap", "a lost line moves the pose by 2 m", ODOMETRY,
-          "            self.filled += filled\n", "            self.filled += filled\n"
+          "        self.filled += filled\n", "        self.filled += filled\n        if filled:\n"
           "            self.pose = Pose(self.pose.x + 2.0, self.pose.y, self.pose.yaw)\n"),
     # latch file
     fault("latches kept", "the latch file is never written", LOOP,

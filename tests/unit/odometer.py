@@ -46,8 +46,8 @@ class Odometer:
     def skip(self, line: Line) -> None:
         self.odometry.skipped.add(line)
 
-    def set_pose(self, pose: Pose) -> None:
-        self.odometry.set_pose(pose, self.model)
+    def set_pose(self, pose: Pose, at_ns: int = 1) -> None:
+        self.odometry.set_pose(pose, self.model, at_ns)
         self.checks.gyro.forget_doubt()
 
 

@@ -10,8 +10,7 @@ from hypothesis import given, settings
 
 from acsard.core.config.settings import OdometryConfig, WheelMap
 from acsard.core.motion.gyro import Turn
-from acsard.core.motion.uncertainty import UNKNOWN_POSE
-from acsard.core.values import Pose, PoseCovariance
+from acsard.core.values import Pose, PoseCovariance, WheelSpeeds
 from tests.each import each
 from tests.unit.nees import PERIOD, RADIUS, TRACK
 from tests.unit.odometer import Odometer
@@ -41,7 +40,6 @@ def test_a_pose_that_is_set_is_as_certain_as_at_the_start_and_standing_adds_noth
     robot = Odometer()
     for _ in range(100):
         assert robot.fold(line(0.0)).covariance == START
-    assert robot.fold(line(0.0, 0.0, gap=2.0)).covariance == START
     assert robot.fold(feedback(4.5, 7.5, 10.0)).covariance != START
     robot.set_pose(Pose(5.0, 5.0, 1.0))
     assert robot.fold(line(0.0)).covariance == START
@@ -213,17 +211,41 @@ def test_a_gap_adds_the_distance_at_the_speeds_around_it_to_the_deviation() -> N
     assert math.sqrt(estimate.covariance.xx) == pytest.approx(0.5, rel=0.01)
 
 
-def test_a_gap_of_years_leaves_a_variance_of_1e9_and_no_more() -> None:
-    robot = Odometer()
-    robot.fold(feedback(4.5, 7.5, 0.0))
-    covariance = robot.fold(feedback(4.5, 7.5, 0.0, gap=1e9)).covariance
-    assert (covariance.xx, covariance.yy, covariance.yawyaw) == (1e9, 1e9, 1e9)
-    assert robot.fold(feedback(4.5, 7.5, 1.0, gap=1.0)).covariance == UNKNOWN_POSE
+def test_a_robot_that_nobody_watched_may_have_been_pushed_but_is_not_unknown() -> None:
+    for gap, away, turned in ((3.0, 2.0, 1.0), (60.0, 10.0, 3.2), (1e9, 10.0, 3.2)):
+        robot = Odometer()
+        robot.fold(line(0.0))
+        covariance = robot.fold(line(0.0, 0.0, gap=gap)).covariance
+        deviations = [math.sqrt(v) for v in (covariance.xx, covariance.yy, covariance.yawyaw)]
+        # The second without a line before adds 0.25 m along and 1 rad.
+        assert deviations == pytest.approx([away, away, math.hypot(turned, 1.0)], rel=0.01)
+        for _ in range(200):
+            covariance = robot.fold(line(10.0), WheelSpeeds(*[10.0] * 4)).covariance
+        assert covariance.xx < 200.0
+        robot.set_pose(Pose(1.0, 2.0, 3.0))
+        assert robot.fold(line(0.0)).covariance.xx < 1e-4
     robot = Odometer(OdometryConfig(yaw_variance_per_metre=10.0))
     for _ in range(1000):  # an unknown heading adds no second order
         estimate = robot.fold(line(20.0))
     assert estimate.covariance.yawyaw > 90.0
     assert max(map(abs, robot.odometry.uncertainty.bend.added)) < 1.0
+
+
+@each("wheels", MAPS)
+@each("counts", [0, 16, 3200])
+@each("lost", [0.01, 0.02])
+def test_a_night_at_rest_with_lost_lines_costs_less_than_a_decimetre(
+    lost: float, counts: int, wheels: WheelMap
+) -> None:
+    """12 hours of 100 lines a second, of which 1 % are lost, one by one or in pairs."""
+    robot = Odometer(counts=counts, wheels=wheels)
+    for _ in range(50):
+        before = robot.fold(line(0.0)).covariance
+    gaps, times = round(0.01 * 12 * 3600 / lost), 20  # each adds as much as the others
+    for _ in range(gaps // times):
+        after = robot.fold(line(0.0, lost + 0.01, bridged=lost)).covariance
+    assert 0.0 < math.sqrt(times * (after.xx - before.xx)) < 0.1
+    assert math.sqrt(times * (after.yawyaw - before.yawyaw)) < 0.1
 
 
 @each("share", [0.0, 0.3, 1.0])

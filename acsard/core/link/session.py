@@ -416,7 +416,10 @@ class McuSession(Struct):
         since_ns = self._link.good(at_ns, setup.quiet_ns)
         silent = since_ns is None or since_ns > setup.quiet_ns
         length = len(line) + 2
-        placed = timeline.place(setup, out, speeds, reading, following, length, silent, asked_ns)
+        waited_ns = self.steps.waited_ns
+        placed = timeline.place(
+            setup, out, speeds, reading, following, length, silent, asked_ns, waited_ns
+        )
         if setup.checked:
             self._check_samples(out, reading)
         return placed

@@ -663,8 +663,8 @@ class SwitchOff(Message, frozen=True):
     release_port: bool = False
     """Also close the serial port until the next `activate`, so that another program can use it. The
     robot must rest. A robot that is stopped or in fault stays so, and only the port is closed. The
-    other program may move the robot, so the pose is unknown until `reset_odometry` or `set_pose`:
-    its variances are 1e9."""
+    other program may move the robot, so the pose is less certain after it, by up to 10 m and 3.2
+    rad, until `reset_odometry` or `set_pose`."""
 
 
 class Settings(Message, frozen=True):
