@@ -72,6 +72,7 @@ def summary(robot: Robot, now_ns: Ns) -> Snapshot:
         bumper=inputs.bumpers.why(config.safety),
         battery=battery,
         board=_board(robot, now_ns),
+        counts_figures=session.counts_figures(robot.link_setup),
         check=session.check(robot.link_setup),
         unanswered=state.unanswered.told,
     )

@@ -437,7 +437,7 @@ FAULTS = (
           'self._warn(i, wheel, wheel.warning or ("wheel_fast" if fast else "wheel_slow"))',
           "pass")),
     fault("counts wrong", "counts that contradict the speeds of their lines are believed",
-          "core/link/board_counts.py", "MAX_DIFFERENCE = 0.2 ", "MAX_DIFFERENCE = 20.0 "),
+          "core/link/board_counts.py", "= 0.03, 2, 0.005, 0.25", "= 30.0, 2, 0.005, 0.25"),
     fault("gyro hangs", "a gyro that repeats one rate is believed", GYRO,
           "self.hangs |= share < MAX_REPEATING and", "self.hangs |= share < 0.0 and"),
     # two driven wheels

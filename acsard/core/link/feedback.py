@@ -59,7 +59,8 @@ class Line(Struct, frozen=True, gc=False):
     # From the previous sample to the end of the last command to move: the first line of zeros, or
     # the board's watchdog. It is negative if that was before the sample.
     driven: Seconds = 0.0
-    doubt: Wheels4 | None = None  # angles by wrong counts, which earlier lines had too much, rad
+    # Angles of this line and earlier ones, by which counts and speeds contradict each other, rad.
+    doubt: Wheels4 | None = None
     asked_ns: Ns | None = None  # when the answered command was written
     heard_ns: Ns = 0  # the host had the complete line
 
@@ -185,13 +186,10 @@ class Timeline(Struct):
             by_board = self._turned(setup, reading, came_ns)
             if by_board is not None:
                 check, by_counts = self.counts_check, setup.codec.wheels(by_board.motors)
-                if not bridged:
-                    check.add(by_counts, speeds.as_tuple(), by_board.dt, setup.count)
-                if check.agrees:
-                    dt = since = by_board.dt
-                    bridged, known, turned = 0.0, known and not silent, by_counts
-                    late = 0.0
-                doubt, check.doubt = check.doubt, None
+                dt = since = by_board.dt
+                if not bridged and dt <= setup.covered_s:
+                    doubt = check.add(by_counts, speeds.as_tuple(), dt, setup.count)
+                bridged, known, turned, late = 0.0, known and not silent, by_counts, 0.0
         elif self.encoders.last is not None:
             self.encoders.forget()
         if not known or self.restarted or dt >= MAX_FILLED_GAP_S:
@@ -199,7 +197,7 @@ class Timeline(Struct):
             dt = bridged = since = late = 0.0
         self.begun = True
         elapsed, wheels, counted, count = dt - bridged, speeds.as_tuple(), None, 0.0
-        if setup.count and self.counts_check.agrees:
+        if setup.count and not self.counts_check.suspected:
             count = setup.count
             step = count / elapsed if elapsed > 0.0 else 0.0
             if turned is None and elapsed > 0.0 and setup.shows_counts:

@@ -208,7 +208,8 @@ def _link(config: Config, snapshot: Snapshot) -> Iterator[Finding]:
         why = f": {reason}" if _is_reason(status) else ""
         yield ERROR, f"{status.link}{why}", advice
     if status.pose_doubt:
-        yield WARN, sentence(cast("PoseCode", status.pose_doubt)).text, ""
+        doubt = sentence(cast("PoseCode", status.pose_doubt))
+        yield WARN, doubt.text + snapshot.counts_figures, ""
     if simulated:
         yield WARN, "this is the simulator, no real wheel turns", SIMULATOR_ADVICE
     if snapshot.unanswered:
