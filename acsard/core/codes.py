@@ -38,7 +38,10 @@ LinkCode = Literal[
 ]  # fmt: skip
 
 # Why the pose may be far off although the link is up.
-PoseCode = Literal["counts_and_speeds_differ", "encoder_counts_missing", "coarse_encoder"]
+PoseCode = Literal[
+    "counts_and_speeds_differ", "encoder_counts_missing", "coarse_encoder", "gyro_disagrees",
+    "not_calibrated",
+]  # fmt: skip
 
 # This computer or the built-in simulator is to blame.
 HOST_CODES: tuple[LinkCode, ...] = ("host_late", "simulator_fault")
@@ -346,6 +349,13 @@ encoder_counts_missing
     the speeds jump as those of coarse encoders do, and mcu.encoder_counts is not set, so the
     heading drifts, and damaged lines are not noticed:
     -> write the counts per turn of a wheel; `acsard mcu check` shows about how many they are
+gyro_disagrees
+    gyro and wheels measure different turns, so the heading is far less certain:
+    -> does the gyro's z axis point up, does it send rad/s, do the wheels slip? If the robot is not
+    calibrated, type `acsard calibrate`
+not_calibrated
+    the robot is not calibrated, so the heading by its wheels is uncertain:
+    -> type `acsard calibrate`
 coarse_encoder
     the encoders are coarse, and lines get lost or come after varying delays, so the pose may be far
     off:

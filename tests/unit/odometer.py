@@ -15,11 +15,14 @@ from acsard.core.motion.uncertainty import ErrorModel
 from acsard.core.values import Estimate, Pose, WheelSpeeds
 from tests.wheels import FOUR
 
+MEASURED = OdometryConfig(wheel_separation_multiplier_std=0.0, distance_scale_std=0.0)
+"""The default noise of a robot whose track and size are known exactly."""
+
 
 class Odometer:
     def __init__(
         self,
-        odometry: OdometryConfig = OdometryConfig(),  # noqa: B008
+        odometry: OdometryConfig = MEASURED,
         counts: int = 0,
         drive: DriveConfig = DriveConfig(),  # noqa: B008
         wheels: WheelMap = FOUR,

@@ -7,21 +7,25 @@ import math
 import numpy as np
 import pytest
 from hypothesis import given, settings
+from msgspec.structs import replace
 
-from acsard.core.config.settings import OdometryConfig, WheelMap
+from acsard.core.config.settings import WheelMap
 from acsard.core.motion.gyro import Turn
 from acsard.core.values import Pose, PoseCovariance, WheelSpeeds
 from tests.each import each
 from tests.unit.nees import PERIOD, RADIUS, TRACK
-from tests.unit.odometer import Odometer
+from tests.unit.odometer import MEASURED, Odometer
 from tests.unit.test_pose import Says, counts, feedback, line, moves
 from tests.wheels import MAPS
 
 law = settings(max_examples=100)
 START = PoseCovariance(1e-6, 0.0, 0.0, 1e-6, 0.0, 1e-6)
 """The default covariance of a pose that was just set."""
-EXACT = OdometryConfig(
-    distance_variance_per_metre=0.0, yaw_variance_per_metre=0.0, yaw_variance_per_radian=0.0
+EXACT = replace(
+    MEASURED,
+    distance_variance_per_metre=0.0,
+    yaw_variance_per_metre=0.0,
+    yaw_variance_per_radian=0.0,
 )
 Matrix = np.ndarray[tuple[int, int], np.dtype[np.float64]]
 
@@ -77,7 +81,7 @@ def test_a_turn_in_place_makes_only_the_yaw_less_certain(sign: float) -> None:
     # side rolls 0.15 m. The side noise k = 1e-4 x 0.3 x 0.3 / 2 = 4.5e-6 makes up all of the yaw's
     # variance per metre. It gives 4.5e-6 x 0.3 / 0.09 = 1.5e-5 of yaw, and 4.5e-6 x 0.3 / 4 =
     # 3.375e-7 of position, a thousandth of the yaw's.
-    robot = Odometer(OdometryConfig(yaw_variance_per_metre=0.0))
+    robot = Odometer(replace(MEASURED, yaw_variance_per_metre=0.0))
     covariance = robot.fold(feedback(-3.0 * sign, 3.0 * sign, 1.0)).covariance
     yaw = 1e-6 + 1e-2 * (1 - math.pi / 1200)
     assert matrix(covariance) == near(PoseCovariance(1e-6, 0, 0, 1e-6, 0, yaw))
@@ -224,7 +228,7 @@ def test_a_robot_that_nobody_watched_may_have_been_pushed_but_is_not_unknown() -
         assert covariance.xx < 200.0
         robot.set_pose(Pose(1.0, 2.0, 3.0))
         assert robot.fold(line(0.0)).covariance.xx < 1e-4
-    robot = Odometer(OdometryConfig(yaw_variance_per_metre=10.0))
+    robot = Odometer(replace(MEASURED, yaw_variance_per_metre=10.0))
     for _ in range(1000):  # an unknown heading adds no second order
         estimate = robot.fold(line(20.0))
     assert estimate.covariance.yawyaw > 90.0

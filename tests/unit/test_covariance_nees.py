@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from msgspec.structs import replace
 
-from acsard.core.config.settings import OdometryConfig, WheelMap
+from acsard.core.config.settings import WheelMap
 from acsard.core.link.feedback import Line
 from acsard.core.values import WheelSpeeds
 from tests.unit.nees import (
@@ -30,7 +30,7 @@ from tests.unit.nees import (
     reports,
     study,
 )
-from tests.unit.odometer import Odometer
+from tests.unit.odometer import MEASURED, Odometer
 from tests.wheels import FOUR, TWO, four_and_two
 
 CALIBRATED = {"ratio_std": 0.0028, "track_std": 0.01, "scale_std": 0.002}
@@ -132,8 +132,11 @@ def test_the_counts_at_both_ends_of_a_short_drive_are_in_the_covariance(wheels: 
     assert 1.9 < values.mean() < 3.0
 
 
-EXACT = OdometryConfig(
-    distance_variance_per_metre=0.0, yaw_variance_per_metre=0.0, yaw_variance_per_radian=0.0
+EXACT = replace(
+    MEASURED,
+    distance_variance_per_metre=0.0,
+    yaw_variance_per_metre=0.0,
+    yaw_variance_per_radian=0.0,
 )
 
 

@@ -8,8 +8,9 @@ from typing import Any
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from msgspec.structs import replace
 
-from acsard.core.config.settings import OdometryConfig, WheelMap
+from acsard.core.config.settings import WheelMap
 from acsard.core.link.feedback import Line
 from acsard.core.motion.gaps import Rolled, Skipped, rolled_over
 from acsard.core.motion.gyro import Gyro, Turn
@@ -22,14 +23,17 @@ from acsard.core.values import (
     WheelSpeeds,
 )
 from tests.each import each
-from tests.unit.odometer import Odometer
+from tests.unit.odometer import MEASURED, Odometer
 from tests.vectors.drive import PATHS, SEED_STEP, SEED_STEP_ARC, SEED_STEP_TWIST
 from tests.wheels import FOUR, MAPS, TWO
 
 law = settings(max_examples=100)
 AT = Instant(5_000_000_000, 1_800_000_000_000_000_000)
-SURE = OdometryConfig(
-    distance_variance_per_metre=1e-8, yaw_variance_per_metre=1e-8, yaw_variance_per_radian=1e-8
+SURE = replace(
+    MEASURED,
+    distance_variance_per_metre=1e-8,
+    yaw_variance_per_metre=1e-8,
+    yaw_variance_per_radian=1e-8,
 )
 Three = tuple[float, float, float]
 wheel_speed = st.floats(-40.0, 40.0)

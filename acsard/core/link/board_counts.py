@@ -26,6 +26,8 @@ from acsard.core.values import Ns, Wheels4
 
 SLACK_COUNTS = 4  # one count at each end of the interval, and play in the gears
 
+LEAP = 5.0  # times the fastest wheel: less may be a wrong `mcu.encoder_counts`, which is compared
+
 NS_PER_MS = 1_000_000
 
 ROUNDING_MS = 2  # each of the two times is in whole ms
@@ -85,7 +87,7 @@ class Encoders(Struct):
         if setup.fastest * (max(host_ms, mcu_ms) + ROUNDING_MS) >= FIELD_VALUES / 2 - SLACK_COUNTS:
             return "unknown"
         counts = [_signed(n - was) for n, was in zip(reading.counts, before.counts, strict=True)]
-        most = setup.fastest * (mcu_ms + ROUNDING_MS) + SLACK_COUNTS
+        most = LEAP * setup.fastest * (mcu_ms + ROUNDING_MS) + SLACK_COUNTS
         if max(counts) > most or min(counts) < -most:
             return "leap"
         return Turned(tuple([n * setup.count for n in counts]), mcu_ms / 1000)
@@ -93,7 +95,8 @@ class Encoders(Struct):
 
 class CountsCheck(Struct):
     differs: bool = False  # in the last window that was full
-    suspected: bool = False  # or in this one, until now
+    # It may in this one, and all wheels by one factor: a wrong setting, and no fault of a wheel.
+    scaled: bool = False
     figures: str = ""  # of the window that differs, and its wheel that differs most
     wheel: int = 0
     # In this window: s of driving, rad of each wheel by its counts and by its speeds.
@@ -143,9 +146,10 @@ class CountsCheck(Struct):
             if beyond > over:
                 over, worst = beyond, wheel
         full = seconds >= WINDOW_S and max(map(abs, counted + reported)) >= WINDOW_ANGLE
-        self.suspected = over > 1.0 or (self.differs and not full)
+        suspected = over > 1.0 or (self.differs and not full)
+        self.scaled = suspected and self._is_scaled(count)
         doubt = None
-        if self.suspected or self.doubted != NONE:
+        if suspected or self.doubted != NONE:
             doubt = _wheels4([now - was for now, was in zip(off, self.doubted, strict=True)])
             self.doubted = off
         if full:
@@ -158,6 +162,11 @@ class CountsCheck(Struct):
                 )
             self._begin(speeds)
         return doubt
+
+    def _is_scaled(self, count: float) -> bool:
+        rows = zip(self.counted, self.reported, strict=True)
+        moved = [one / other for one, other in rows if abs(other) > EDGES * count]
+        return bool(moved) and max(moved) - min(moved) < SHARE * max(moved)
 
     def _begin(self, speeds: Wheels4) -> None:
         self.begin, self.seconds, self.compared_s = speeds, 0.0, 0.0

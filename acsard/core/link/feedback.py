@@ -53,7 +53,7 @@ class Line(Struct, frozen=True, gc=False):
     # By how much later than when it was due the line came, less that of the line before it.
     late: Seconds = 0.0
     counted: Wheels4 | None = None
-    count: Rad = 0.0  # angle of one count; 0 if it is not declared
+    count: Rad = 0.0  # angle of one count; 0 if it is not declared, or seems wrong
     step: RadPerS = 0.0  # change of a speed that one count explains; inf if unknown
     since: Seconds = 0.0  # by the board's clock or arrivals, for plausibility; 0 after a gap
     # From the previous sample to the end of the last command to move: the first line of zeros, or
@@ -197,7 +197,7 @@ class Timeline(Struct):
             dt = bridged = since = late = 0.0
         self.begun = True
         elapsed, wheels, counted, count = dt - bridged, speeds.as_tuple(), None, 0.0
-        if setup.count and not self.counts_check.suspected:
+        if setup.count and not self.counts_check.scaled:
             count = setup.count
             step = count / elapsed if elapsed > 0.0 else 0.0
             if turned is None and elapsed > 0.0 and setup.shows_counts:

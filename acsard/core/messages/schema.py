@@ -450,8 +450,8 @@ class RobotState(Message, frozen=True):
     pose_doubt: Annotated[str, one_of(["", *get_args(PoseCode)])] = ""
     """Code of why the pose may be far off although the link is up; empty if nothing shows that.
 
-    `encoder_counts_missing` advises `mcu.encoder_counts`, and `coarse_encoder`
-    `mcu.link_check = "on"`.
+    `encoder_counts_missing` advises `mcu.encoder_counts`, `coarse_encoder` `mcu.link_check = "on"`,
+    and `not_calibrated` `acsard calibrate`.
     """
     sender: str = ""
     """Public name of the selected sender of `source`; empty while no sender is selected.

@@ -100,7 +100,9 @@ class Odometry(Struct):
         # Counts are valid even after a silence: the wheels turned by them in its time, too.
         whole = seconds if line.turned is None else seconds + line.gap
         seen = rolled
-        if gap and gap.filled and line.turned is None:
+        if line.turned is not None and not line.count:
+            seen = times(reported, seconds)  # the counts seem wrong, which is no fault of a wheel
+        elif gap and gap.filled and line.turned is None:
             # The next line confirms a speed behind a silence.
             seen = times(self.speeds.as_tuple(), seconds)
         known = gap is None or not gap.unknown
@@ -152,7 +154,7 @@ class Odometry(Struct):
             if at_rest:
                 uncertainty.set_rest(model, self.rested, slips, rate_variance)
             else:
-                uncertainty.set_twist(model, self.twist, slips, rate_variance)
+                uncertainty.set_twist(model, self.twist, line.step, slips, rate_variance)
             heading = yaw - turned / 2
             if self.set_ns:
                 uncertainty.doubt((distance / 2) ** 2, (angle / 2) ** 2, 0.0, heading)

@@ -21,6 +21,7 @@ from typing import Literal
 from msgspec import Struct, field
 
 from acsard.core.config.settings import FeedbackConfig, LimitsConfig, OdometryConfig
+from acsard.core.link.coarse_encoders import LARGEST_JUMP
 from acsard.core.link.feedback import MAX_FILLED_GAP_S
 from acsard.core.motion.agreement import claims
 from acsard.core.motion.kinematics import Kinematics
@@ -31,6 +32,7 @@ from acsard.core.values import (
     Pose,
     PoseCovariance,
     Rad,
+    RadPerS,
     Seconds,
     Twist,
     TwistVariances,
@@ -119,7 +121,7 @@ class ErrorModel:
         self.skid = odometry.yaw_variance_per_radian
 
         ratio, gyro = odometry.wheel_radius_ratio_std, odometry.gyro_scale_std
-        share = odometry.wheel_separation_multiplier_std / kinematics.multipliers[2]
+        share = odometry.track_std(independent) / kinematics.multipliers[2]
         scale = (odometry.distance_scale_std, 0.0, 0.0, 0.0)
         # One radius is larger by half of the ratio's error, the other smaller.
         longer, none = ratio * track / 4, NO_EFFECT
@@ -300,14 +302,19 @@ class Uncertainty(Struct):
         self.columns[i] = x + c * distance, y + s * distance, yaw + turn
         self._publish()
 
-    def set_twist(self, model: ErrorModel, twist: Twist, slips: bool, gyro: float | None) -> None:
+    def set_twist(
+        self, model: ErrorModel, twist: Twist, step: RadPerS, slips: bool, gyro: float | None
+    ) -> None:
         """Set the variances of a moving robot's twist, with those of the gyro's rate, rad2/s2.
+
+        `step` is the change of a speed by one count, if the counts are not declared; inf: unknown.
 
         A pose that is integrated from twists is as uncertain as that of the odometry. The errors of
         parameters and of the quantization of the speeds come on top.
         """
         linear, angular, period = twist.linear, twist.angular, self.period
-        quantum = max(SPEED_RESOLUTION, model.count / period) ** 2
+        count = model.count / period if model.count else min(step, LARGEST_JUMP / period)
+        quantum = max(SPEED_RESOLUTION, count) ** 2
         along, yaw, _ = model.noise(linear, angular, abs(angular))
         along, yaw = along / period, yaw / period
         for of_distance, of_turn, turn_of_distance, turn_of_turn in model.effects[0]:
