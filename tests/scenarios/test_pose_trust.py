@@ -15,7 +15,7 @@ from acsard.core.config.settings import (
     WheelMap,
 )
 from acsard.core.simulator import fake_mcu
-from acsard.core.simulator.fake_mcu import FakeMcu
+from tests.scenarios.boards import blocks, reports_its_last_instant
 from tests.scenarios.world import World
 from tests.wheels import four_and_two
 
@@ -27,29 +27,6 @@ def sigmas(world: World) -> float:
     state, true, cells = world.state, world.mcu.vehicle.pose, world.odom.pose.covariance
     off = state.x - true.x, state.y - true.y, math.remainder(state.yaw - true.yaw, math.tau)
     return max(abs(e) / math.sqrt(cells[k]) for e, k in zip(off, (0, 7, 35), strict=True))
-
-
-def reports_its_last_instant(mcu: FakeMcu) -> None:
-    """Let the board report the speeds of now, as firmware with windows of 10 ms does."""
-
-    def speeds(now_ns: int) -> list[float]:
-        return [sign * mcu.vehicle.speeds[motors[0]] for motors, sign in mcu._wiring]
-
-    mcu._speeds = speeds  # type: ignore[method-assign]
-
-
-def blocks(mcu: FakeMcu, every_s: float, block_s: float) -> None:
-    """Let the firmware block, and then answer all lines that wait in its buffer."""
-    act, every_ns, block_ns = mcu._act, int(every_s * 1e9), int(block_s * 1e9)
-
-    def acts(now_ns: int, line: bytes) -> None:
-        free_ns = now_ns // every_ns * every_ns + block_ns
-        if now_ns < free_ns:
-            mcu._schedule(free_ns, "act", line)
-        else:
-            act(now_ns, line)
-
-    mcu._act = acts  # type: ignore[method-assign]
 
 
 @pytest.mark.parametrize("stall", [0.2, 0.4, 0.6])

@@ -15,8 +15,10 @@ from acsard.core.motion.uncertainty import ErrorModel
 from acsard.core.values import Estimate, Pose, WheelSpeeds
 from tests.wheels import FOUR
 
-MEASURED = OdometryConfig(wheel_separation_multiplier_std=0.0, distance_scale_std=0.0)
-"""The default noise of a robot whose track and size are known exactly."""
+MEASURED = OdometryConfig(
+    wheel_separation_multiplier_std=0.0, wheel_radius_ratio_std=0.0, distance_scale_std=0.0
+)
+"""The default noise of a robot whose track and wheels are known exactly."""
 
 
 class Odometer:

@@ -326,7 +326,7 @@ class OdometryConfig(Struct, frozen=True):
     yaw_variance_per_metre: ErrorRate = 1e-4
     yaw_variance_per_radian: ErrorRate = 1e-2
     wheel_separation_multiplier_std: Deviation | Literal["uncalibrated"] = "uncalibrated"
-    wheel_radius_ratio_std: Deviation = 0.0
+    wheel_radius_ratio_std: Deviation = 0.01
     distance_scale_std: Deviation = 0.02
 
     @property

@@ -43,6 +43,8 @@ from acsard.core.values import (
     WheelSpeeds,
 )
 
+RECENT_S = 2.0  # within which a wheel that is to be doubted is found out
+
 
 class Odometry(Struct):
     """Pose, covariance and angles of the wheels. What is derived from settings is in `model`."""
@@ -54,6 +56,7 @@ class Odometry(Struct):
     speeds: WheelSpeeds = STILL  # in the last line
     positions: Wheels4 = AT_REST  # of the wheels, rad
     travelled: Metres = 0.0  # since the daemon started, forwards plus backwards
+    recent: Metres = 0.0  # the same, in about the last `RECENT_S`
     skipped: Skipped = field(default_factory=Skipped)
     held: Wheels4 = AT_REST  # rad at rest; for the pose beyond two counts, or in a drive
     rested: Seconds = math.inf  # of zero speeds, without gaps
@@ -125,6 +128,7 @@ class Odometry(Struct):
         if turn is not None:
             angle, angular, variance = turn.angle, turn.rate, turn.variance
         self.travelled += abs(distance)
+        self.recent = (self.recent + abs(distance)) * RECENT_S / (RECENT_S + seconds)
         last, self.twist, self.speeds = self.twist, Twist(linear, angular), speeds
 
         pose, path, uncertainty = self.pose, self.path, self.uncertainty
@@ -176,8 +180,9 @@ class Odometry(Struct):
                 distance, angle = model.kinematics.moved(angles)
                 angle = 0.0 if turn is not None else angle
                 uncertainty.miss(side, MISSED_STD * distance, MISSED_STD * angle, heading)
-                # With a turn that was missed, too, the distance may have been to any side.
-                aside = (MISSED_STD * distance) ** 2 * min(1.0, angle**2)
+                # With a turn that was missed, too, the distance may have been to any side, and so
+                # the way in which it was missed.
+                aside = (MISSED_STD * (abs(distance) + self.recent)) ** 2 * min(1.0, angle**2)
                 uncertainty.doubt(aside, 0.0, aside, heading)
         return Estimate(
             line.at, self.pose, self.twist, uncertainty.covariance, uncertainty.twist,
