@@ -129,6 +129,20 @@ def reverse_left(world: World) -> None:
     world.mcu.switches.encoder_signs = signs
 
 
+def freeze(world: World) -> None:
+    world.mcu.switches.frozen = 1
+
+
+def overflow(world: World) -> None:
+    """Let the firmware's field for a speed hold less than 10 rad/s, as a signed number."""
+    speeds = world.mcu._speeds
+
+    def wrapped(now_ns: int) -> list[float]:
+        return [(speed + 10.0) % 20.0 - 10.0 for speed in speeds(now_ns)]
+
+    world.mcu._speeds = wrapped  # type: ignore[method-assign]
+
+
 def pushed_away(world: World) -> None:
     """Pull the cable for 8 s, in which a person pushes the robot for 2 s."""
     mcu = world.mcu
@@ -182,6 +196,8 @@ ROWS = {
     "counts 15 % too small": Row(replace(CHECKED, encoder_counts=3680)),
     "left encoders reversed": Row(disturb=at(FAULT_S, reverse_left)),
     "a wheel 1.5 times too fast": Row(fault=biased_side),
+    "a wheel keeps its last speed": Row(disturb=at(FAULT_S, freeze)),
+    "the speed field overflows": Row(begin=overflow),
     "pushed without its cable": Row(CHECKED, disturb=at(FAULT_S, pushed_away)),
     "gyro": Row(odometry=GYRO),
     "gyro, its bias steps": Row(odometry=GYRO, disturb=at(FAULT_S, biased)),
