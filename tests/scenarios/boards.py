@@ -5,6 +5,12 @@ from __future__ import annotations
 from acsard.core.simulator.fake_mcu import FakeMcu
 
 
+def turn_encoders(mcu: FakeMcu, angles: list[float]) -> None:
+    """Let the wheels stand at these angles, so that their counts do not change together."""
+    mcu.vehicle.angles[:] = angles
+    mcu._window = (mcu._window[0], mcu._encoders())
+
+
 def reports_its_last_instant(mcu: FakeMcu) -> None:
     """Let the board report the speeds of now, as firmware with windows of 10 ms does."""
 

@@ -17,7 +17,7 @@ from msgspec import Struct
 from msgspec.structs import replace
 
 from acsard.core.config.settings import Config, McuConfig, OdometryConfig, SimConfig, WheelMap
-from tests.scenarios.boards import blocks, reports_its_last_instant
+from tests.scenarios.boards import blocks, reports_its_last_instant, turn_encoders
 from tests.scenarios.imperfect_gyro import ImperfectGyro
 from tests.scenarios.world import World
 from tests.unit.nees import nees
@@ -69,9 +69,8 @@ def drawn(row: Row, seed: int, wheels: WheelMap) -> World:
     vehicle._right_radius *= size * (1.0 + ratio / 2.0)
     # The declared deviation is of the multiplier by which the configuration is too small.
     vehicle._track *= max(0.4, 1.0 + dice.gauss(0.0, declared.track_std(len(wheels.names))))
-    vehicle.angles[:] = [dice.uniform(0.0, 0.5) for _ in range(4)]
-    if wheels.left:
-        vehicle.angles[2:] = [vehicle.angles[1], vehicle.angles[0]]
+    right, left, *rear = [dice.uniform(0.0, 0.5) for _ in range(4)]
+    turn_encoders(world.mcu, [right, left, *((left, right) if wheels.left else rear)])
     return world
 
 

@@ -11,6 +11,7 @@ import pytest
 
 from acsard.core.config.settings import Config, McuConfig, OdometryConfig, SimConfig, WheelMap
 from acsard.core.messages.state_warnings import warnings
+from tests.scenarios.boards import turn_encoders
 from tests.scenarios.imperfect_gyro import ImperfectGyro
 from tests.scenarios.world import World
 from tests.stepped import Outputs
@@ -120,7 +121,7 @@ def test_a_gyro_that_contradicts_the_wheels_is_a_doubt_and_is_said(
     assert heading_sigmas(world) < 3.0
     if change is sound:
         assert doubts == {""}
-    elif change is not larger or plan is not straight:  # it has too few turns
+    elif (plan, change) not in ((straight, larger), (left, step)):  # too little shows it
         assert "gyro_disagrees" in doubts
 
 
@@ -132,7 +133,7 @@ def test_the_twist_of_encoders_with_unknown_counts_is_as_uncertain_as_a_count(
 ) -> None:
     mcu = McuConfig(wheels=wheels, reply_period=period)
     world = World(Config(mcu=mcu, sim=SimConfig(encoder_counts=counts)))
-    world.mcu.vehicle.angles[:] = [0.0, 0.1, 0.2, 0.25]  # their edges are not at equal angles
+    turn_encoders(world.mcu, [0.0, 0.1, 0.2, 0.25])
     squares: list[tuple[float, float, float, float]] = []
 
     def watch(outputs: Outputs) -> None:

@@ -15,7 +15,7 @@ from acsard.core.config.settings import (
     WheelMap,
 )
 from acsard.core.simulator import fake_mcu
-from tests.scenarios.boards import blocks, reports_its_last_instant
+from tests.scenarios.boards import blocks, reports_its_last_instant, turn_encoders
 from tests.scenarios.world import World
 from tests.wheels import four_and_two
 
@@ -118,7 +118,7 @@ def test_a_board_that_reports_rarely_gives_the_mean_of_its_wheels(
     """No line is damaged, so no line is repaired. The counts are not declared."""
     mcu = McuConfig(reply_period=period)
     world = World(Config(mcu=mcu, sim=SimConfig(encoder_counts=counts)))
-    world.mcu.vehicle.angles[:] = [0.0, 0.1, 0.2, 0.25]  # their edges are not at equal angles
+    turn_encoders(world.mcu, [0.0, 0.1, 0.2, 0.25])
     with world.mcu.fault("free_running", period):
         world.run(1.5)
         world.drive(speed, 0.0, 12.0)

@@ -31,8 +31,9 @@ DEVIATIONS = 3.0  # of what both claim; more is a contradiction
 DISAGREES_S = 5.0  # after a contradiction
 
 # Of a bias that shows while the turns vary: blocks, share of their variance, rad/s of the gyro, and
-# share by which tyres are unequal.
-LEAST_BLOCKS, LEAST_SPREAD, STEADY_RATE, TYRES = 10.0, 0.1, 0.005, 0.003
+# share by which tyres are unequal. Wheels slip alike in some blocks.
+LEAST_BLOCKS, LEAST_SPREAD, STEADY_RATE, TYRES = 40.0, 0.1, 0.005, 0.003
+SIMILAR_BLOCKS = 1.3
 
 # True turn divided by the turn of the wheels, on any floor.
 MIN_RATIO, MAX_RATIO = 0.25, 2.5
@@ -129,7 +130,7 @@ class Steady(Struct):
         bias = (self.td * self.ww - self.wd * self.tw) / spread
         share = (self.wd * self.tt - self.td * self.tw) / spread
         rest = max(0.0, self.dd - bias * self.td - share * self.wd) / (self.blocks - 2.0)
-        variance = rest * self.ww / spread + bias_variance
+        variance = SIMILAR_BLOCKS * rest * self.ww / spread + bias_variance
         tyres = TYRES * self.way / (2.0 * claims.half_track * self.seconds)
         most = DEVIATIONS * math.sqrt(variance + tyres * tyres) + STEADY_RATE
         return bias if abs(bias) > most else 0.0
