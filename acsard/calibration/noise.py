@@ -58,7 +58,7 @@ class Noise(Struct, frozen=True):
     distance_better: bool
 
 
-def noise(runs: Sequence[Run], fit: Fit, odometry: OdometryConfig) -> Noise:
+def noise(runs: Sequence[Run], fit: Fit, odometry: OdometryConfig, wheels: int = 4) -> Noise:
     """Return the noise that the runs of a fit show, and whether it describes them better."""
     headings, distances = _Rows(), _Rows()
     # Positions alone show the heading over long ways only, and so in whole runs.
@@ -74,7 +74,7 @@ def noise(runs: Sequence[Run], fit: Fit, odometry: OdometryConfig) -> Noise:
     track = fit.base.track * math.exp(fit.p[2])
     stated = np.array([
         odometry.yaw_variance_per_metre, odometry.yaw_variance_per_radian,
-        (odometry.wheel_separation_multiplier_std * fit.base.track / track) ** 2,
+        (odometry.track_std(wheels) * fit.base.track / track) ** 2,
         (odometry.wheel_radius_ratio_std / track) ** 2, 0.0,
     ])  # fmt: skip
     by_heading, heading_better = _fitted(headings, stated)

@@ -86,7 +86,7 @@ def _result(log: Log, config: Config, source: str, found: Fit, notes: list[str])
     if not found.sized:
         stds = np.where([name == TRACK_NAME for name in MULTIPLIERS], found.shares[0], stds)
     stds = stds * configured * factors
-    shown = noise(log.runs, found, config.odometry)
+    shown = noise(log.runs, found, config.odometry, len(config.mcu.wheels.names))
     settings: dict[str, float] = {}
     decisions = [*_geometry(found, config, settings, shown)]
     misread = _misread(found, [run.name for run in log.runs])

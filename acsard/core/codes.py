@@ -38,7 +38,10 @@ LinkCode = Literal[
 ]  # fmt: skip
 
 # Why the pose may be far off although the link is up.
-PoseCode = Literal["encoder_counts_wrong", "encoder_counts_missing", "coarse_encoder"]
+PoseCode = Literal[
+    "counts_and_speeds_differ", "encoder_counts_missing", "coarse_encoder", "gyro_disagrees",
+    "not_calibrated",
+]  # fmt: skip
 
 # This computer or the built-in simulator is to blame.
 HOST_CODES: tuple[LinkCode, ...] = ("host_late", "simulator_fault")
@@ -347,14 +350,22 @@ received_sparse
     -> if the board reports by its own clock, set mcu.reply_period to the seconds between its lines;
     `acsard mcu check` finds out more
 
-encoder_counts_wrong
-    the angles by the board's counts and by its speeds differ, so mcu.encoder_counts is wrong, and
-    the pose uses the speeds:
-    -> write the counts per turn of a wheel that `acsard mcu check` shows
+counts_and_speeds_differ
+    the board's counts and its speeds contradict each other, so mcu.encoder_counts is wrong, or the
+    firmware computes wrong speeds; the pose uses the counts, and its uncertainty the difference:
+    -> write the counts per turn of a wheel that `acsard mcu check` shows; if they are right,
+    correct the speeds in the firmware
 encoder_counts_missing
     the speeds jump as those of coarse encoders do, and mcu.encoder_counts is not set, so the
     heading drifts, and damaged lines are not noticed:
     -> write the counts per turn of a wheel; `acsard mcu check` shows about how many they are
+gyro_disagrees
+    gyro and wheels measure different turns, so the heading is far less certain:
+    -> does the gyro's z axis point up, does it send rad/s, do the wheels slip? If the robot is not
+    calibrated, type `acsard calibrate`
+not_calibrated
+    the robot is not calibrated, so the heading by its wheels is uncertain:
+    -> type `acsard calibrate`
 coarse_encoder
     the encoders are coarse, and lines get lost or come after varying delays, so the pose may be far
     off:

@@ -73,8 +73,8 @@ UNLATCHED = (Mode.DRIVING, Mode.READY)  # their reason depends only on the choic
 QUIET = News()
 
 PORT_LENT = (
-    "the serial port is closed; type `acsard call activate` to open it again. The pose is then "
-    "unknown until `acsard call reset_odometry` or `acsard call set_pose`"
+    "the serial port is closed; type `acsard call activate` to open it again. The robot may have "
+    "been pushed until then, so its pose is less certain: `acsard call set_pose` says where it is"
 )
 
 ALREADY_LENT = (
@@ -499,9 +499,9 @@ class Robot:
                 return message, numbers
             case "activate":
                 if life.loan in (request.numbers or ()):
-                    self._end_loan()  # even if the rest is refused
+                    life.loan = 0  # even if the rest is refused
                 numbers = life.activate(request.numbers, asked_ns)
-                self._end_loan()
+                life.loan = 0
                 state.arbiter.forget_clocks()
                 state.arbiter.require_neutral(asked_ns)
                 return "active", numbers
@@ -511,7 +511,7 @@ class Robot:
                 message = life.deactivate(request.by, now)
                 return message, (life.latches.last,)
             case "set_pose" | "reset_odometry":
-                return self.place(request.pose or Pose()), ()
+                return self.place(request.pose or Pose(), now.mono_ns), ()
             case "set":
                 changes |= self._set(request.settings, now.mono_ns)
                 return describe_changes(changes) or NOTHING_CHANGED, ()
@@ -533,11 +533,6 @@ class Robot:
         state.checks.gyro.rest_s = 0.0
         return PORT_LENT, (*numbers, state.life.lend())
 
-    def _end_loan(self) -> None:
-        if self.state.life.loan:
-            self.state.life.loan = 0
-            self.state.odometry.uncertainty.lose()
-
     @property
     def _at_rest(self) -> bool:
         # Two lines are zero: the last one that left, which the wheels follow, and the last one that
@@ -550,9 +545,9 @@ class Robot:
         speed = max(map(abs, state.odometry.speeds.as_tuple())) * self.model.kinematics.radius
         return not state.session.silent(now_ns) and speed > LEAST_SPEED
 
-    def place(self, pose: Pose) -> str:
+    def place(self, pose: Pose, at_ns: Ns) -> str:
         state = self.state
-        state.odometry.set_pose(pose, self.model)
+        state.odometry.set_pose(pose, self.model, at_ns)
         state.count("poses_set")
         state.checks.gyro.forget_doubt()
         pose = state.odometry.pose

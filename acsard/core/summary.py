@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from typing import Literal
+
+from acsard.core.codes import PoseCode
 from acsard.core.link.board_status import as_text
 from acsard.core.messages.schema import BatterySummary, Cause, RobotState, SourceState, Time
 from acsard.core.messages.snapshot import Snapshot
 from acsard.core.motion.arbiter_text import waiting
 from acsard.core.robot import Robot
-from acsard.core.values import NS_PER_S, BatteryStatus, Ns
+from acsard.core.values import NS_PER_S, BatteryStatus, GyroStatus, Ns
 from acsard.core.values import Cause as LatchedCause
 
 
@@ -50,7 +53,7 @@ def summary(robot: Robot, now_ns: Ns) -> Snapshot:
             gyro=gyro.does,
             encoder_counts=list(session.encoder_counts(robot.link_setup)),
             wheel_fault=wheels.text,
-            pose_doubt=session.pose_warning.code,
+            pose_doubt=_pose_doubt(robot, gyro),
             sender=state.choice.sender,
             causes=[
                 _cause(cause, state.life.shown.get(cause.number), now_ns)
@@ -72,9 +75,19 @@ def summary(robot: Robot, now_ns: Ns) -> Snapshot:
         bumper=inputs.bumpers.why(config.safety),
         battery=battery,
         board=_board(robot, now_ns),
+        counts_figures=session.counts_figures(robot.link_setup),
         check=session.check(robot.link_setup),
         unanswered=state.unanswered.told,
     )
+
+
+def _pose_doubt(robot: Robot, gyro: GyroStatus) -> PoseCode | Literal[""]:
+    if code := robot.state.session.pose_warning.code:
+        return code
+    if gyro.does == "disagrees":
+        return "gyro_disagrees"
+    config = robot.config
+    return "" if config.odometry.calibrated or config.mcu.simulated else "not_calibrated"
 
 
 def _counters(robot: Robot) -> dict[str, int]:

@@ -20,6 +20,7 @@ from acsard.bus.address import Address, address_of
 from acsard.bus.tls_files import host_and_port
 from acsard.bus.zenoh_sessions import answers, reachable
 from acsard.client.connection import Connection, open_connection
+from acsard.core.codes import reason
 from acsard.core.config.contradictions import is_loopback, warnings
 from acsard.core.config.live import differences
 from acsard.core.config.parsing import ConfigError, from_builtins, parse
@@ -121,6 +122,9 @@ def local(config: Config, address: Address, written: str, pid: int | None) -> It
     """
     for warning in warnings(config):
         yield Finding("configuration", "warning", warning, "see acsard.toml")
+    if not (config.odometry.calibrated or config.mcu.simulated):
+        why = reason("not_calibrated")
+        yield Finding("calibration", "warning", why.text.rstrip(":"), why.advice)
     yield from serial_port(config.mcu.port, config.mcu.simulated and pid is None)
     yield from computer(config.control.real_time, pid)
     for directory in dict.fromkeys((config.bus.tls, address.tls, written)):

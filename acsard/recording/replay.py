@@ -309,7 +309,7 @@ class Playback:
         if not (stays and recorded.line and not max_wheel_speed(recorded.line)):
             return False
         robot, self._waits = Robot(config), None
-        robot.place(Pose(*(part / US_PER_S for part in self._poses[1])))
+        robot.place(Pose(*(part / US_PER_S for part in self._poses[1])), step.now.mono_ns)
         self._resume(Restored(robot, Memory()))
         return True
 

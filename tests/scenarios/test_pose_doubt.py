@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Callable
+from itertools import count
 
 import pytest
 
@@ -38,18 +40,68 @@ def sigmas(world: World) -> float:
     )
 
 
-@pytest.mark.variations(3)
-@pytest.mark.parametrize("wrong", [4.0, 0.25, 1.5])
+@pytest.mark.variations(7)
+@pytest.mark.parametrize("wrong", [4.0, 0.25, 1.5, 3000 / 3200, 2800 / 3200, 1.05, 1.2])
 @four_and_two
-def test_with_wrong_counts_the_pose_uses_the_speeds_and_a_warning_says_so(
+def test_counts_that_contradict_the_speeds_are_a_doubt_and_a_warning_has_both_values(
     wrong: float, wheels: WheelMap
 ) -> None:
+    """Either may be wrong, so the pose goes on with the counts."""
     robot = world(3200, "on", round(3200 * wrong), wheels)
-    drive(robot)
+    robot.run(0.5)
+    robot.drive(0.5, 0.0, 6.0)
+    assert robot.state.pose_doubt == "counts_and_speeds_differ"
+    (event,) = [event for event in robot.events if event.name == "pose_doubtful"]
+    assert event.code == "counts_and_speeds_differ"
+    assert re.search(r"[\d.]+ rad by its counts and [\d.]+ rad by its speeds in 5.\d s", event.text)
+    assert "mcu.encoder_counts is wrong, or the firmware" in event.text
+    robot.hold(0.4, 0.8, 4.0)
     robot.hold(0.0, 0.0, 1.0)
-    assert robot.state.pose_doubt == "encoder_counts_wrong"
-    assert [e.code for e in robot.events if e.name == "pose_doubtful"] == ["encoder_counts_wrong"]
+    assert robot.state.x > 0.0
+    assert sigmas(robot) < 2.0
+
+
+@pytest.mark.variations(6)
+@pytest.mark.parametrize("counts", [16, 96, 3200])
+@pytest.mark.parametrize("lag", [0.0, 0.05, 0.2])
+@pytest.mark.parametrize("speed", [0.05, 0.3, 0.8])
+@four_and_two
+def test_a_firmware_that_filters_its_speeds_contradicts_no_counts(
+    speed: float, lag: float, counts: int, wheels: WheelMap
+) -> None:
+    robot = world(counts, "on", wheels=wheels)
+    measured, filtered = robot.mcu._speeds, [0.0] * 4
+
+    def speeds(now_ns: int) -> list[float]:
+        nonlocal filtered
+        keep = math.exp(-0.01 / lag) if lag else 0.0
+        rows = zip(measured(now_ns), filtered, strict=False)
+        filtered = [keep * before + (1 - keep) * now for now, before in rows]
+        return filtered
+
+    robot.mcu._speeds = speeds  # type: ignore[method-assign]
+    robot.run(0.5)
+    for k in range(10):
+        robot.drive(speed, 0.3 * (-1) ** k, 2.3)
+        robot.drive(-speed / 2, 0.0, 0.7)
+    assert robot.state.pose_doubt == ""
     assert sigmas(robot) < 3.0
+
+
+def test_encoders_that_tremble_at_rest_contradict_no_speeds() -> None:
+    robot = world(3200, "on")
+    robot.run(0.5)
+    robot.drive(0.3, 0.0, 2.0)
+    robot.hold(0.0, 0.0, 1.0)
+    sample, calls = robot.mcu._sample, count()
+
+    def trembling() -> tuple[int, ...]:
+        now, *counts = sample()
+        return now, *[n + next(calls) % 2 for n in counts]
+
+    robot.mcu._sample = trembling  # type: ignore[method-assign]
+    robot.run(8.0)
+    assert robot.state.pose_doubt == ""
 
 
 @four_and_two
@@ -85,7 +137,7 @@ def test_lines_are_not_judged_by_counts_that_are_wrong(configured: int) -> None:
     before = robot.state.counters.get("line_implausible", 0)
     robot.hold(0.5, 0.0, 7.0)
     robot.hold(0.0, 0.0, 1.0)
-    assert robot.state.pose_doubt == "encoder_counts_wrong"
+    assert robot.state.pose_doubt == "counts_and_speeds_differ"
     assert robot.state.counters.get("line_implausible", 0) == before
     assert sigmas(robot) < 3.0
 

@@ -406,8 +406,7 @@ FAULTS = (
     fault("odometry set", "set_pose takes x for y", ODOMETRY,
           "self.pose = Pose(pose.x, pose.y, math", "self.pose = Pose(pose.y, pose.x, math"),
     fault("odometry gap", "a gap while the robot moves does not make the pose less certain",
-          ODOMETRY, "            if gap and not (rested",
-          "            if gap and gap.seconds > 1e9 and not (rested"),
+          ODOMETRY, "            if gap:\n", "            if gap and gap.seconds > 1e9:\n"),
     fault("odometry vague", "the covariance of the pose is a hundred times as large as the errors",
         UNCERTAINTY, "        self.covariance = p if known else UNKNOWN_POSE\n",
         "        p = PoseCovariance(*(100.0 * getattr(p, name) for name in p.__struct_fields__))\n"
@@ -425,7 +424,7 @@ FAULTS = (
           "            p = type(p)(math.inf, p.xy, p.xyaw, p.yy, p.yyaw, p.yawyaw)\n"
           "            self.uncertainty.covariance = p\n"),
     fault("odometry leap", "a lost line moves the pose by 2 m", ODOMETRY,
-          "            self.filled += filled\n", "            self.filled += filled\n"
+          "        self.filled += filled\n", "        self.filled += filled\n        if filled:\n"
           "            self.pose = Pose(self.pose.x + 2.0, self.pose.y, self.pose.yaw)\n"),
     # latch file
     fault("latches kept", "the latch file is never written", LOOP,
@@ -454,7 +453,7 @@ FAULTS = (
           Edit(WHEELS_LAW, "slow, beyond = min(obedience.slow), min(obedience.fast)",
           "slow = beyond = 0.0")),
     fault("counts wrong", "counts that contradict the speeds of their lines are believed",
-          "core/link/board_counts.py", "MAX_DIFFERENCE = 0.2 ", "MAX_DIFFERENCE = 20.0 "),
+          "core/link/board_counts.py", "= 0.03, 2, 0.005, 0.25", "= 30.0, 2, 0.005, 0.25"),
     fault("gyro hangs", "a gyro that repeats one rate is believed", GYRO,
           "self.hangs |= share < MAX_REPEATING and", "self.hangs |= share < 0.0 and"),
     # two driven wheels

@@ -15,11 +15,16 @@ from acsard.core.motion.uncertainty import ErrorModel
 from acsard.core.values import Estimate, Pose, WheelSpeeds
 from tests.wheels import FOUR
 
+MEASURED = OdometryConfig(
+    wheel_separation_multiplier_std=0.0, wheel_radius_ratio_std=0.0, distance_scale_std=0.0
+)
+"""The default noise of a robot whose track and wheels are known exactly."""
+
 
 class Odometer:
     def __init__(
         self,
-        odometry: OdometryConfig = OdometryConfig(),  # noqa: B008
+        odometry: OdometryConfig = MEASURED,
         counts: int = 0,
         drive: DriveConfig = DriveConfig(),  # noqa: B008
         wheels: WheelMap = FOUR,
@@ -46,8 +51,8 @@ class Odometer:
     def skip(self, line: Line) -> None:
         self.odometry.skipped.add(line)
 
-    def set_pose(self, pose: Pose) -> None:
-        self.odometry.set_pose(pose, self.model)
+    def set_pose(self, pose: Pose, at_ns: int = 1) -> None:
+        self.odometry.set_pose(pose, self.model, at_ns)
         self.checks.gyro.forget_doubt()
 
 

@@ -315,13 +315,14 @@ def test_what_no_reading_can_tell(mcu_ms: float, host_ms: float, result: str) ->
 
 @each(("wheels", "motor"), [(wheels, n) for wheels in MAPS for n in range(len(wheels.names))])
 @each("sign", [1, -1])
-def test_a_movement_beyond_the_fastest_speed_is_a_leap(
+def test_a_movement_beyond_five_times_the_fastest_speed_is_a_leap(
     wheels: WheelMap, motor: int, sign: int
 ) -> None:
-    # Two ms of rounding and four counts of play.
+    # Less may be a wrong setting. Two ms of rounding and four counts of play.
     board, moved = Board(wheels), [0] * len(wheels.names)
-    moved[motor] = sign * (int(FASTEST / math.tau * COUNTS * 0.012) + 4)
+    moved[motor] = sign * (int(5.0 * FASTEST / math.tau * COUNTS * 0.012) + 4)
     assert isinstance(board.read(10, tuple(moved)), Turned)
+    moved[motor] *= 2
     moved[motor] += 2 * sign
     assert board.read(10, tuple(moved)) == "leap"
     assert board.goes_on()

@@ -7,22 +7,25 @@ import math
 import numpy as np
 import pytest
 from hypothesis import given, settings
+from msgspec.structs import replace
 
-from acsard.core.config.settings import OdometryConfig, WheelMap
+from acsard.core.config.settings import WheelMap
 from acsard.core.motion.gyro import Turn
-from acsard.core.motion.uncertainty import UNKNOWN_POSE
-from acsard.core.values import Pose, PoseCovariance
+from acsard.core.values import Pose, PoseCovariance, WheelSpeeds
 from tests.each import each
 from tests.unit.nees import PERIOD, RADIUS, TRACK
-from tests.unit.odometer import Odometer
+from tests.unit.odometer import MEASURED, Odometer
 from tests.unit.test_pose import Says, counts, feedback, line, moves
 from tests.wheels import MAPS
 
 law = settings(max_examples=100)
 START = PoseCovariance(1e-6, 0.0, 0.0, 1e-6, 0.0, 1e-6)
 """The default covariance of a pose that was just set."""
-EXACT = OdometryConfig(
-    distance_variance_per_metre=0.0, yaw_variance_per_metre=0.0, yaw_variance_per_radian=0.0
+EXACT = replace(
+    MEASURED,
+    distance_variance_per_metre=0.0,
+    yaw_variance_per_metre=0.0,
+    yaw_variance_per_radian=0.0,
 )
 Matrix = np.ndarray[tuple[int, int], np.dtype[np.float64]]
 
@@ -41,7 +44,6 @@ def test_a_pose_that_is_set_is_as_certain_as_at_the_start_and_standing_adds_noth
     robot = Odometer()
     for _ in range(100):
         assert robot.fold(line(0.0)).covariance == START
-    assert robot.fold(line(0.0, 0.0, gap=2.0)).covariance == START
     assert robot.fold(feedback(4.5, 7.5, 10.0)).covariance != START
     robot.set_pose(Pose(5.0, 5.0, 1.0))
     assert robot.fold(line(0.0)).covariance == START
@@ -79,7 +81,7 @@ def test_a_turn_in_place_makes_only_the_yaw_less_certain(sign: float) -> None:
     # side rolls 0.15 m. The side noise k = 1e-4 x 0.3 x 0.3 / 2 = 4.5e-6 makes up all of the yaw's
     # variance per metre. It gives 4.5e-6 x 0.3 / 0.09 = 1.5e-5 of yaw, and 4.5e-6 x 0.3 / 4 =
     # 3.375e-7 of position, a thousandth of the yaw's.
-    robot = Odometer(OdometryConfig(yaw_variance_per_metre=0.0))
+    robot = Odometer(replace(MEASURED, yaw_variance_per_metre=0.0))
     covariance = robot.fold(feedback(-3.0 * sign, 3.0 * sign, 1.0)).covariance
     yaw = 1e-6 + 1e-2 * (1 - math.pi / 1200)
     assert matrix(covariance) == near(PoseCovariance(1e-6, 0, 0, 1e-6, 0, yaw))
@@ -213,17 +215,41 @@ def test_a_gap_adds_the_distance_at_the_speeds_around_it_to_the_deviation() -> N
     assert math.sqrt(estimate.covariance.xx) == pytest.approx(0.5, rel=0.01)
 
 
-def test_a_gap_of_years_leaves_a_variance_of_1e9_and_no_more() -> None:
-    robot = Odometer()
-    robot.fold(feedback(4.5, 7.5, 0.0))
-    covariance = robot.fold(feedback(4.5, 7.5, 0.0, gap=1e9)).covariance
-    assert (covariance.xx, covariance.yy, covariance.yawyaw) == (1e9, 1e9, 1e9)
-    assert robot.fold(feedback(4.5, 7.5, 1.0, gap=1.0)).covariance == UNKNOWN_POSE
-    robot = Odometer(OdometryConfig(yaw_variance_per_metre=10.0))
+def test_a_robot_that_nobody_watched_may_have_been_pushed_but_is_not_unknown() -> None:
+    for gap, away, turned in ((3.0, 2.0, 1.0), (60.0, 10.0, 3.2), (1e9, 10.0, 3.2)):
+        robot = Odometer()
+        robot.fold(line(0.0))
+        covariance = robot.fold(line(0.0, 0.0, gap=gap)).covariance
+        deviations = [math.sqrt(v) for v in (covariance.xx, covariance.yy, covariance.yawyaw)]
+        # The second without a line before adds 0.25 m along and 1 rad.
+        assert deviations == pytest.approx([away, away, math.hypot(turned, 1.0)], rel=0.01)
+        for _ in range(200):
+            covariance = robot.fold(line(10.0), WheelSpeeds(*[10.0] * 4)).covariance
+        assert covariance.xx < 200.0
+        robot.set_pose(Pose(1.0, 2.0, 3.0))
+        assert robot.fold(line(0.0)).covariance.xx < 1e-4
+    robot = Odometer(replace(MEASURED, yaw_variance_per_metre=10.0))
     for _ in range(1000):  # an unknown heading adds no second order
         estimate = robot.fold(line(20.0))
     assert estimate.covariance.yawyaw > 90.0
     assert max(map(abs, robot.odometry.uncertainty.bend.added)) < 1.0
+
+
+@each("wheels", MAPS)
+@each("counts", [0, 16, 3200])
+@each("lost", [0.01, 0.02])
+def test_a_night_at_rest_with_lost_lines_costs_less_than_a_decimetre(
+    lost: float, counts: int, wheels: WheelMap
+) -> None:
+    """12 hours of 100 lines a second, of which 1 % are lost, one by one or in pairs."""
+    robot = Odometer(counts=counts, wheels=wheels)
+    for _ in range(50):
+        before = robot.fold(line(0.0)).covariance
+    gaps, times = round(0.01 * 12 * 3600 / lost), 20  # each adds as much as the others
+    for _ in range(gaps // times):
+        after = robot.fold(line(0.0, lost + 0.01, bridged=lost)).covariance
+    assert 0.0 < math.sqrt(times * (after.xx - before.xx)) < 0.1
+    assert math.sqrt(times * (after.yawyaw - before.yawyaw)) < 0.1
 
 
 @each("share", [0.0, 0.3, 1.0])

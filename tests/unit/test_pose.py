@@ -8,8 +8,9 @@ from typing import Any
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from msgspec.structs import replace
 
-from acsard.core.config.settings import OdometryConfig, WheelMap
+from acsard.core.config.settings import WheelMap
 from acsard.core.link.feedback import Line
 from acsard.core.motion.gaps import Rolled, Skipped, rolled_over
 from acsard.core.motion.gyro import Gyro, Turn
@@ -22,14 +23,17 @@ from acsard.core.values import (
     WheelSpeeds,
 )
 from tests.each import each
-from tests.unit.odometer import Odometer
+from tests.unit.odometer import MEASURED, Odometer
 from tests.vectors.drive import PATHS, SEED_STEP, SEED_STEP_ARC, SEED_STEP_TWIST
 from tests.wheels import FOUR, MAPS, TWO
 
 law = settings(max_examples=100)
 AT = Instant(5_000_000_000, 1_800_000_000_000_000_000)
-SURE = OdometryConfig(
-    distance_variance_per_metre=1e-8, yaw_variance_per_metre=1e-8, yaw_variance_per_radian=1e-8
+SURE = replace(
+    MEASURED,
+    distance_variance_per_metre=1e-8,
+    yaw_variance_per_metre=1e-8,
+    yaw_variance_per_radian=1e-8,
 )
 Three = tuple[float, float, float]
 wheel_speed = st.floats(-40.0, 40.0)
@@ -128,7 +132,7 @@ def roll(feedback: Line, *skipped: Line) -> Rolled:
     before = Skipped()
     for one in skipped:
         before.add(one)
-    return rolled_over(before, feedback, (10.0,) * 4, None)
+    return rolled_over(before, feedback, (10.0,) * 4, (10.0,) * 4, 4)
 
 
 @each(
@@ -165,7 +169,7 @@ def test_how_far_a_line_rolls(
 def test_a_false_speed_after_a_gap_or_in_a_long_line_does_not_make_a_wrong_pose_certain(
     seconds: float, bridged: float, false: float, speed: float, wheel: int, wheels: WheelMap
 ) -> None:
-    """The other wheel of its side outvotes it. Without one the pose is wrong, and says so."""
+    """The line may be right, so the pose uses it, and says how wrong it may be."""
     robot, driven = Odometer(SURE, wheels=wheels), WheelSpeeds(*[speed] * 4)
     for _ in range(30):
         robot.fold(line(speed), driven)
@@ -177,8 +181,6 @@ def test_a_false_speed_after_a_gap_or_in_a_long_line_does_not_make_a_wrong_pose_
     pose, covariance = robot.pose, robot.fold(line(speed), driven).covariance
     way = speed * 0.05 * (0.3 + seconds)
     off, turned = math.dist((pose.x, pose.y), (way, 0.0)), abs(pose.yaw)
-    if wheels is FOUR:
-        assert max(off, turned) < 1e-9
     assert turned < 1.2 * math.sqrt(covariance.yawyaw)
     assert off < 1.2 * math.sqrt(covariance.xx + covariance.yy)
 
@@ -221,9 +223,8 @@ def test_one_damaged_speed_behind_a_silence_is_no_fault_of_a_wheel_that_stopped(
     assert set(faults) == {None}
 
 
-def test_gaps_and_bridged_times_are_counted_but_a_gap_at_rest_is_not() -> None:
+def test_gaps_and_bridged_times_are_counted() -> None:
     robot = Odometer()
-    robot.fold(line(0.0, 0.0, gap=2.0))
     assert robot.odometry.counters() == {}
     robot.fold(line(5.0))
     robot.fold(line(5.0, 0.0, gap=0.25))

@@ -63,14 +63,17 @@ class Bench:
         gap: bool = False,
         asked_ns: int | None = None,
     ) -> list[Line]:
-        """Read this many lines at once, `ms` later. With `gap`, the first one follows a silence."""
+        """Read this many lines at once, `ms` later: this computer was late.
+
+        With `gap`, the first one follows a silence.
+        """
         self.now_ns += int(ms * MS)
         at = Instant(self.now_ns, self.now_ns + 7)
         self.timeline.process_read(self.setup, self.out, at, LENGTH * lines, lines, 0)
         return [
             self.timeline.place(
                 self.setup, self.out, SPEEDS, reading, LENGTH * behind, LENGTH,
-                gap and behind == lines - 1, asked_ns,
+                gap and behind == lines - 1, asked_ns, int(ms * MS),
             )
             for behind in reversed(range(lines))
         ]  # fmt: skip

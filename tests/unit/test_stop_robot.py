@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+import math
+
 import pytest
 from msgspec.structs import replace
 
 from acsard.core.config.settings import Config, McuConfig, OdometryConfig
-from acsard.core.motion.uncertainty import UNKNOWN_POSE
 from acsard.core.values import (
     BRIDGES,
     REST,
     Announcement,
     Command,
+    Pose,
     Request,
     Verb,
     WheelSpeeds,
@@ -70,19 +72,28 @@ def test_the_port_is_released_at_rest_and_a_robot_that_was_off_stays_off(
     assert (rig.robot.port_released, rig.mode) == (False, mode)
 
 
-def test_the_pose_is_unknown_after_another_program_had_the_port_until_it_is_set() -> None:
+def test_a_robot_may_have_been_pushed_while_another_program_had_the_port() -> None:
     rig = Rig(REAL).linked()
     rig.run(100)
-    rig.unplug().step(ms=10_000)
-    assert rig.replug().linked().out.estimates[-1].covariance != UNKNOWN_POSE
     (answer,) = rig.asked(Request("deactivate", 1, release_port=True)).answers
-    assert "unknown until `acsard call reset_odometry`" in answer.message
-    rig.unplug().asked(Request("reset_odometry", 2))
+    assert "may have been pushed" in answer.message
+    rig.unplug().step(ms=4_000)
     rig.replug().asked(Request("activate", 3, numbers=answer.numbers))
-    assert rig.linked().out.estimates[-1].covariance == UNKNOWN_POSE
+    assert rig.linked().out.estimates[-1].covariance.xx == pytest.approx(9.0, rel=0.1)
     rig.asked(Request("reset_odometry", 4))
     rig.run(5)
     assert rig.out.estimates[-1].covariance.xx < 1e-4
+
+
+def test_a_pose_that_is_set_while_the_board_is_away_is_as_certain_as_the_time_since_then() -> None:
+    rig = Rig(REAL).linked()
+    rig.run(100)
+    rig.unplug().step(ms=12 * 3600 * 1000)
+    rig.asked(Request("set_pose", 4, pose=Pose(1.0, 2.0, 0.5)))
+    rig.step(ms=1_500)
+    estimate = rig.replug().linked().out.estimates[-1]
+    assert (estimate.pose.x, estimate.pose.y) == (1.0, 2.0)
+    assert 0.25 < math.sqrt(estimate.covariance.yy) < 0.8
 
 
 def test_while_another_program_has_the_port_no_silence_of_an_input_counts() -> None:

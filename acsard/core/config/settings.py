@@ -311,6 +311,11 @@ class CommandsConfig(Struct, frozen=True):
     )
 
 
+# By the number of driven wheels, of the track's multiplier before a calibration. Four fixed wheels
+# skid, and turn real robots as if they were 1.5 to 2 times as far apart.
+UNCALIBRATED_STD = {4: 0.3, 2: 0.05}
+
+
 class OdometryConfig(Struct, frozen=True):
     odom_frame: FrameId = "odom"
     base_frame: FrameId = "base_link"
@@ -320,9 +325,19 @@ class OdometryConfig(Struct, frozen=True):
     distance_variance_per_metre: ErrorRate = 1e-4
     yaw_variance_per_metre: ErrorRate = 1e-4
     yaw_variance_per_radian: ErrorRate = 1e-2
-    wheel_separation_multiplier_std: Deviation = 0.0
-    wheel_radius_ratio_std: Deviation = 0.0
-    distance_scale_std: Deviation = 0.0
+    wheel_separation_multiplier_std: Deviation | Literal["uncalibrated"] = "uncalibrated"
+    wheel_radius_ratio_std: Deviation = 0.01
+    distance_scale_std: Deviation = 0.02
+
+    @property
+    def calibrated(self) -> bool:
+        """Whether anybody has measured the track, and has written how well."""
+        return self.wheel_separation_multiplier_std != "uncalibrated"
+
+    def track_std(self, wheels: int) -> float:
+        """Return the standard deviation of the multiplier of the track of a robot with `wheels`."""
+        given = self.wheel_separation_multiplier_std
+        return UNCALIBRATED_STD[wheels] if given == "uncalibrated" else given
 
 
 class LidarConfig(Struct, frozen=True):

@@ -5,13 +5,14 @@ clock, so it does not depend on when the host read the lines. Both are modulo 65
 used only if the counts cannot have wrapped and a wheel at its highest speed can make it. Otherwise
 the caller uses speed times time. The module also detects a probable restart of the board.
 
-The firmware computes counts and speeds from the same edges, so they differ only if
-`mcu.encoder_counts` is wrong. Then the pose uses the speeds, and the difference until then becomes
-a doubt, which the covariance contains.
+The firmware computes counts and speeds from the same edges. If they contradict each other, either
+may be wrong: the pose goes on using the counts, and the difference is a doubt, which the covariance
+contains (`CountsCheck`).
 """
 
 from __future__ import annotations
 
+import math
 from typing import Literal
 
 from msgspec import Struct
@@ -25,6 +26,8 @@ from acsard.core.values import Ns, Wheels4
 
 SLACK_COUNTS = 4  # one count at each end of the interval, and play in the gears
 
+LEAP = 5.0  # times the fastest wheel: less may be a wrong `mcu.encoder_counts`, which is compared
+
 NS_PER_MS = 1_000_000
 
 ROUNDING_MS = 2  # each of the two times is in whole ms
@@ -32,18 +35,18 @@ ROUNDING_MS = 2  # each of the two times is in whole ms
 # Excess over the least delay, which then rises; the session restarts after a gap of 1 s.
 MAX_DELAY_MS = 1000.0
 
-# Driving in the windows of `CountsCheck`, s; the first is short, so that wrong counts move the pose
-# little.
-WINDOW_S, FIRST_S = 1.0, 0.1
+# Of driving, in a window of `CountsCheck`, and of a wheel.
+WINDOW_S, WINDOW_ANGLE = 5.0, 2 * math.tau
 
-MAX_DIFFERENCE = 0.2  # relative
+# By which the angles of a wheel may differ: a share, counts (one at each end), rad/s by rounding,
+# and s by a filter of the speeds, times the change of the speed.
+SHARE, EDGES, ROUNDING, FILTER_S = 0.03, 2, 0.005, 0.25
 
-MIN_COUNTS = 40  # of all wheels in a window: fewer are wrong by their edges
+COMPARED_S = 0.1  # between two comparisons
+SETTLE_S = 0.5  # from rest to the first window: the speeds of a filter rise later than the counts
+IDLE_S = 0.5  # without any motion, between two counts of a coarse encoder
 
 NONE: Wheels4 = (0.0, 0.0, 0.0, 0.0)
-
-# Windows in a row that differ. In one, firmware that filters its speeds may have sped up.
-WRONG_WINDOWS = 2
 
 # No previous reading, or maybe a wrapped count; more than a motor can have turned; a restart.
 Unknown = Literal["unknown", "leap", "restarted"]
@@ -84,52 +87,95 @@ class Encoders(Struct):
         if setup.fastest * (max(host_ms, mcu_ms) + ROUNDING_MS) >= FIELD_VALUES / 2 - SLACK_COUNTS:
             return "unknown"
         counts = [_signed(n - was) for n, was in zip(reading.counts, before.counts, strict=True)]
-        most = setup.fastest * (mcu_ms + ROUNDING_MS) + SLACK_COUNTS
+        most = LEAP * setup.fastest * (mcu_ms + ROUNDING_MS) + SLACK_COUNTS
         if max(counts) > most or min(counts) < -most:
             return "leap"
         return Turned(tuple([n * setup.count for n in counts]), mcu_ms / 1000)
 
 
 class CountsCheck(Struct):
-    agrees: bool = True  # in the last window
-    compared: bool = False
-    differing: int = 0  # windows in a row
-    # In this window: s of driving, and rad of all wheels by the counts and by the speeds.
-    seconds: float = 0.0
-    counted: float = 0.0
-    reported: float = 0.0
-    off: Wheels4 = NONE  # by the counts minus by the speeds, rad
-    doubt: Wheels4 | None = None  # `off` of a window that ends with the last line and differs
+    differs: bool = False  # in the last window that was full
+    # It may in this one, and all wheels by one factor: a wrong setting, and no fault of a wheel.
+    scaled: bool = False
+    figures: str = ""  # of the window that differs, and its wheel that differs most
+    wheel: int = 0
+    # In this window: s of driving, rad of each wheel by its counts and by its speeds.
+    seconds: float = -SETTLE_S
+    counted: Wheels4 = NONE
+    reported: Wheels4 = NONE
+    doubted: Wheels4 = NONE  # of the difference
+    idle_s: float = 0.0  # since the last motion
+    begin: Wheels4 = NONE  # speeds, rad/s
+    # At the last comparison: the time, and `reported`.
+    compared_s: float = -SETTLE_S
+    compared: Wheels4 = NONE
 
-    def add(self, turned: Wheels4, speeds: Wheels4, dt: float, count: float) -> None:
-        """Add a line: the angles by its counts, its speeds, and the time by the board's clock."""
-        a, b, c, d = turned
+    def add(self, turned: Wheels4, speeds: Wheels4, dt: float, count: float) -> Wheels4 | None:
+        """Add a line: the angles by its counts, its speeds, and the time by the board's clock.
+
+        Return the difference that is to be doubted, rad, less that of earlier lines.
+        """
+        if turned == NONE == speeds:
+            self.idle_s += dt
+            return None
+        idle_s, self.idle_s = self.idle_s, 0.0
+        seconds = self.seconds = self.seconds + dt + (idle_s if idle_s < IDLE_S else 0.0)
+        a, b, c, d = self.counted
+        e, f, g, h = turned
+        self.counted = a + e, b + f, c + g, d + h
+        a, b, c, d = self.reported
         e, f, g, h = speeds
-        counted = abs(a) + abs(b) + abs(c) + abs(d)
-        reported = (abs(e) + abs(f) + abs(g) + abs(h)) * dt
-        if not counted and not reported:
-            return
-        self.seconds += dt
-        self.counted += counted
-        self.reported += reported
-        off_a, off_b, off_c, off_d = self.off
-        self.off = (
-            off_a + a - e * dt, off_b + b - f * dt, off_c + c - g * dt, off_d + d - h * dt,
-        )  # fmt: skip
-        window_s = WINDOW_S if self.compared else FIRST_S
-        if self.seconds >= window_s and max(self.counted, self.reported) >= MIN_COUNTS * count:
-            off = abs(self.counted - self.reported)
-            self.compared, used = True, self.agrees
-            self.agrees = off <= MAX_DIFFERENCE * self.reported
-            if used and not self.agrees:
-                self.doubt = self.off
-            self.differing = 0 if self.agrees else self.differing + 1
-            self.seconds, self.counted, self.reported, self.off = 0.0, 0.0, 0.0, NONE
+        self.reported = a + e * dt, b + f * dt, c + g * dt, d + h * dt
+        since = seconds - self.compared_s
+        return self._compare(count, since) if since >= COMPARED_S else None
 
-    @property
-    def wrong(self) -> bool:
-        """Whether the configured number of counts is wrong."""
-        return self.differing >= WRONG_WINDOWS
+    def _compare(self, count: float, since: float) -> Wheels4 | None:
+        counted, reported, seconds = self.counted, self.reported, self.seconds
+        rows = zip(reported, self.compared, strict=True)
+        speeds = _wheels4([(now - was) / since for now, was in rows])
+        if self.compared_s < 0.0 <= seconds:
+            self._begin(speeds)  # of a robot that was at rest
+            return None
+        self.compared_s, self.compared = seconds, reported
+        off = _wheels4([one - other for one, other in zip(counted, reported, strict=True)])
+        over = 1.0
+        wheels = zip(off, counted, reported, speeds, self.begin, strict=True)
+        for wheel, (difference, one, other, now, then) in enumerate(wheels):
+            most = SHARE * max(abs(one), abs(other)) + EDGES * count + ROUNDING * seconds
+            beyond = abs(difference) / (most + FILTER_S * abs(now - then))
+            if beyond > over:
+                over, worst = beyond, wheel
+        full = seconds >= WINDOW_S and max(map(abs, counted + reported)) >= WINDOW_ANGLE
+        suspected = over > 1.0 or (self.differs and not full)
+        self.scaled = suspected and self._is_scaled(count)
+        doubt = None
+        if suspected or self.doubted != NONE:
+            doubt = _wheels4([now - was for now, was in zip(off, self.doubted, strict=True)])
+            self.doubted = off
+        if full:
+            self.differs, self.figures = over > 1.0, ""
+            if self.differs:
+                one, other, self.wheel = counted[worst], reported[worst], worst
+                self.figures = (
+                    f"{one:.1f} rad by its counts and {other:.1f} rad by its speeds in "
+                    f"{seconds:.1f} s"
+                )
+            self._begin(speeds)
+        return doubt
+
+    def _is_scaled(self, count: float) -> bool:
+        rows = zip(self.counted, self.reported, strict=True)
+        moved = [one / other for one, other in rows if abs(other) > EDGES * count]
+        return bool(moved) and max(moved) - min(moved) < SHARE * max(moved)
+
+    def _begin(self, speeds: Wheels4) -> None:
+        self.begin, self.seconds, self.compared_s = speeds, 0.0, 0.0
+        self.counted = self.reported = self.doubted = self.compared = NONE
+
+
+def _wheels4(values: list[float]) -> Wheels4:
+    front_right, front_left, rear_left, rear_right = values
+    return front_right, front_left, rear_left, rear_right
 
 
 def _signed(difference: int) -> int:

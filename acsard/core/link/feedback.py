@@ -13,7 +13,12 @@ from acsard.core.config.wire_time import wire_ns
 from acsard.core.link.board_counts import CountsCheck, Encoders, Turned
 from acsard.core.link.checked_line import Reading
 from acsard.core.link.coarse_encoders import CoarseEncoders
-from acsard.core.link.line_times import FreeRunning, Prompted
+from acsard.core.link.line_times import (
+    MAX_ADAPTER_DELAY_NS,
+    USB_JITTER_NS,
+    FreeRunning,
+    Prompted,
+)
 from acsard.core.link.link_output import Output
 from acsard.core.link.link_setup import LinkSetup
 from acsard.core.link.whole_counts import WholeCounts
@@ -43,14 +48,19 @@ class Line(Struct, frozen=True, gc=False):
     turned: Wheels4 | None = None
     # Of `dt`, in which lines were lost. It comes first, and the odometry fills it.
     bridged: Seconds = 0.0
+    # Of the rest of `dt`, which the line may not cover: its board may report its last instant.
+    vague: Seconds = 0.0
+    # By how much later than when it was due the line came, less that of the line before it.
+    late: Seconds = 0.0
     counted: Wheels4 | None = None
-    count: Rad = 0.0  # angle of one count; 0 if it is not declared
+    count: Rad = 0.0  # angle of one count; 0 if it is not declared, or seems wrong
     step: RadPerS = 0.0  # change of a speed that one count explains; inf if unknown
     since: Seconds = 0.0  # by the board's clock or arrivals, for plausibility; 0 after a gap
     # From the previous sample to the end of the last command to move: the first line of zeros, or
     # the board's watchdog. It is negative if that was before the sample.
     driven: Seconds = 0.0
-    doubt: Wheels4 | None = None  # angles by wrong counts, which earlier lines had too much, rad
+    # Angles of this line and earlier ones, by which counts and speeds contradict each other, rad.
+    doubt: Wheels4 | None = None
     asked_ns: Ns | None = None  # when the answered command was written
     heard_ns: Ns = 0  # the host had the complete line
 
@@ -78,6 +88,10 @@ class Timeline(Struct):
     read_lines: int = 0
     heard_ns: Ns = 0  # the last line was complete
     last: Instant | None = None  # sample time of the last line
+    # By which the last line was made later than due, and came later.
+    shifted_ns: Ns = 0
+    held_ns: Ns = 0
+    burst_ns: Ns = 0  # since the first one of the lines that came without a pause
     counts_check: CountsCheck = field(default_factory=CountsCheck)
     gaps: int = 0  # lines behind lost ones
     leaps: int = 0  # lines with impossible counts, for which speed times time is used
@@ -91,6 +105,7 @@ class Timeline(Struct):
         self.whole = WholeCounts()
         self.coarse.forget()
         self.counts_check = CountsCheck()
+        self.shifted_ns = self.held_ns = self.burst_ns = 0
         self.begun = False
 
     def process_read(
@@ -129,11 +144,13 @@ class Timeline(Struct):
         length: int,
         silent: bool,
         asked_ns: Ns | None = None,
+        waited_ns: Ns = 0,
     ) -> Line:
         """Return the next line of the read, which must be a good one.
 
         `following` bytes of the read come after it, and `length` is its own with its end. `silent`
-        says that it ends a silence, or is the first since the opening or a restart.
+        says that it ends a silence, or is the first since the opening or a restart. It waited for
+        this computer for at most `waited_ns`.
         """
         self.rest -= 1
         # Bytes that followed in the same read were on the wire after this line was complete.
@@ -152,7 +169,16 @@ class Timeline(Struct):
             expected_ns, dt_ns, bridged_ns = self.prompted.place(
                 out, self.end_ns, asked_ns, setup.command_interval_ns
             )
-        dt, bridged, gap = dt_ns / NS_PER_S, bridged_ns / NS_PER_S, 0.0
+        if came_ns - before_ns <= wire_ns(length, setup.mcu.baud_rate) + USB_JITTER_NS:
+            self.burst_ns += came_ns - before_ns  # it may have waited for the wire only
+        else:
+            self.burst_ns = 0
+        held_ns = came_ns - self.burst_ns - expected_ns
+        held_ns = held_ns if held_ns < 0 else max(0, held_ns - waited_ns)
+        shift_ns, late_ns = self._shift(held_ns, dt_ns)
+        bridged_ns = max(0, bridged_ns + min(0, shift_ns))  # the time is in a line before it
+        dt, bridged, gap = (dt_ns + shift_ns) / NS_PER_S, bridged_ns / NS_PER_S, 0.0
+        late = late_ns / NS_PER_S
         known, turned, doubt, self.restarted = self.begun, None, None, False
         if bridged > 0.0:
             self.gaps += 1
@@ -160,20 +186,18 @@ class Timeline(Struct):
             by_board = self._turned(setup, reading, came_ns)
             if by_board is not None:
                 check, by_counts = self.counts_check, setup.codec.wheels(by_board.motors)
-                if not bridged:
-                    check.add(by_counts, speeds.as_tuple(), by_board.dt, setup.count)
-                if check.agrees:
-                    dt = since = by_board.dt
-                    bridged, known, turned = 0.0, known and not silent, by_counts
-                doubt, check.doubt = check.doubt, None
+                dt = since = by_board.dt
+                if not bridged and dt <= setup.covered_s:
+                    doubt = check.add(by_counts, speeds.as_tuple(), dt, setup.count)
+                bridged, known, turned, late = 0.0, known and not silent, by_counts, 0.0
         elif self.encoders.last is not None:
             self.encoders.forget()
         if not known or self.restarted or dt >= MAX_FILLED_GAP_S:
             gap = 0.0 if last is None else max(since, dt)
-            dt = bridged = since = 0.0
+            dt = bridged = since = late = 0.0
         self.begun = True
         elapsed, wheels, counted, count = dt - bridged, speeds.as_tuple(), None, 0.0
-        if setup.count and self.counts_check.agrees:
+        if setup.count and not self.counts_check.scaled:
             count = setup.count
             step = count / elapsed if elapsed > 0.0 else 0.0
             if turned is None and elapsed > 0.0 and setup.shows_counts:
@@ -186,6 +210,10 @@ class Timeline(Struct):
                 self.whole.carried = 0.0
         else:
             step = self.coarse.step(wheels, elapsed, len(setup.codec.letters))
+        vague = 0.0
+        if turned is None and elapsed > setup.covered_s:
+            vague = elapsed - setup.line_s
+        expected_ns += self.shifted_ns
         expected_ns = expected_ns if expected_ns < came_ns else came_ns
         # Pass the fields by position: creating a struct by its names takes three times as long.
         return Line(
@@ -195,6 +223,8 @@ class Timeline(Struct):
             gap,
             turned,
             bridged,
+            vague,
+            late,
             counted,
             count,
             step,
@@ -204,6 +234,16 @@ class Timeline(Struct):
             asked_ns,
             came_ns,
         )
+
+    def _shift(self, held_ns: Ns, dt_ns: Ns) -> tuple[Ns, Ns]:
+        # A line that came later than an adapter holds it was made when it came: firmware that
+        # blocks answers all that waits at once, and its first answer has the motion of that time.
+        # The time between is a doubt. Returns by how much the shift and this time have grown.
+        shifted_ns, before_ns = self.shifted_ns, self.held_ns
+        shift_ns = held_ns if held_ns > MAX_ADAPTER_DELAY_NS else 0
+        shift_ns = max(shift_ns, shifted_ns - dt_ns)  # not before the line before it
+        self.shifted_ns, self.held_ns = shift_ns, held_ns
+        return shift_ns - shifted_ns, self.held_ns - before_ns
 
     def _sampled(self, mono_ns: Ns) -> Instant:
         last, wall_ns = self.last, self.read.wall_ns - self.read.mono_ns + mono_ns

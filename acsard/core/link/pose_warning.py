@@ -35,8 +35,8 @@ class PoseWarning(Struct):
 
     def choose_code(self, setup: LinkSetup, timeline: Timeline, lines: int) -> bool:
         """Choose the code by the last `WINDOW_LINES`, and return whether it has changed."""
-        if timeline.counts_check.wrong:
-            before, self.code = self.code, "encoder_counts_wrong"
+        if timeline.counts_check.differs:
+            before, self.code = self.code, "counts_and_speeds_differ"
             return before != self.code
         passed = lines - self.lines
         if passed < WINDOW_LINES:

@@ -156,7 +156,7 @@ class McuSession(Struct):
                 self._decide_link(setup, out, now_ns)
         self.until_ns = until_ns
         if feedback and (
-            self.good_lines >= self.pose_warning.due_lines or self._timeline.counts_check.differing
+            self.good_lines >= self.pose_warning.due_lines or self._timeline.counts_check.differs
         ):
             self._warn_of_pose(setup)
         if self._rejected:
@@ -218,6 +218,11 @@ class McuSession(Struct):
     def coarse_lines(self) -> int:
         """Lines of coarse encoders whose counts are not declared."""
         return self._timeline.coarse.lines
+
+    def counts_figures(self, setup: LinkSetup) -> str:
+        """Return the values of counts and speeds that contradict each other, for people."""
+        check = self._timeline.counts_check
+        return f" ({setup.mcu.wheels.names[check.wheel]}: {check.figures})" if check.differs else ""
 
     def encoder_counts(self, setup: LinkSetup) -> tuple[int, ...]:
         """Return the declared counts per turn of each wheel; 0 if the speeds contradict them."""
@@ -314,7 +319,8 @@ class McuSession(Struct):
         changed = self.pose_warning.choose_code(setup, self._timeline, self.good_lines)
         if changed and self.pose_warning.code:
             why = sentence(self.pose_warning.code)
-            self.events.append(Event("pose_doubtful", why.text, "warning", code=why.code))
+            text = why.text + self.counts_figures(setup)
+            self.events.append(Event("pose_doubtful", text, "warning", code=why.code))
 
     def _announce(self, setup: LinkSetup) -> None:
         link, trouble, before = self._link.state, self._trouble, self._announced
@@ -417,7 +423,10 @@ class McuSession(Struct):
         since_ns = self._link.good(at_ns, setup.quiet_ns)
         silent = since_ns is None or since_ns > setup.quiet_ns
         length = len(line) + 2
-        placed = timeline.place(setup, out, speeds, reading, following, length, silent, asked_ns)
+        waited_ns = self.steps.waited_ns
+        placed = timeline.place(
+            setup, out, speeds, reading, following, length, silent, asked_ns, waited_ns
+        )
         if setup.checked:
             self._check_samples(out, reading)
         return placed

@@ -23,12 +23,19 @@ class StepTimes(Struct):
     passed_ns: Ns = 0  # between the last two steps
     step_s: Seconds = 0.0  # the same, if lines may be missing for it
     late_s: Seconds = 0.0  # largest `step_s` since the last good line
+    # For which a line may have waited that this step reads: the longest time between two steps,
+    # less the period, until `CATCH_UP_NS` after it.
+    waited_ns: Ns = 0
+    catches_up_ns: Ns = 0
 
     def begin(self, setup: LinkSetup, now_ns: Ns) -> Ns | None:
         """Begin a step, and return when the one before began."""
         before_ns, self.at_ns = self.at_ns, now_ns
         passed_ns = self.passed_ns = 0 if before_ns is None else now_ns - before_ns
         self.step_s = passed_ns / NS_PER_S if passed_ns >= setup.late_step_ns else 0.0
+        late_ns = max(0, passed_ns - setup.command_interval_ns)
+        if late_ns >= self.waited_ns or now_ns > self.catches_up_ns:
+            self.waited_ns, self.catches_up_ns = late_ns, now_ns + CATCH_UP_NS
         return before_ns
 
     @property

@@ -207,8 +207,9 @@ def _link(config: Config, snapshot: Snapshot) -> Iterator[Finding]:
         reason = status.reason.removesuffix(" `acsard mcu check` finds out more").rstrip(";")
         why = f": {reason}" if _is_reason(status) else ""
         yield ERROR, f"{status.link}{why}", advice
-    if status.pose_doubt:
-        yield WARN, sentence(cast("PoseCode", status.pose_doubt)).text, ""
+    if status.pose_doubt not in ("", "gyro_disagrees", "not_calibrated"):
+        doubt = sentence(cast("PoseCode", status.pose_doubt))
+        yield WARN, doubt.text + snapshot.counts_figures, ""
     if simulated:
         yield WARN, "this is the simulator, no real wheel turns", SIMULATOR_ADVICE
     if snapshot.unanswered:

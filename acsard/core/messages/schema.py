@@ -451,8 +451,8 @@ class RobotState(Message, frozen=True):
     pose_doubt: Annotated[str, one_of(["", *get_args(PoseCode)])] = ""
     """Code of why the pose may be far off although the link is up; empty if nothing shows that.
 
-    `encoder_counts_missing` advises `mcu.encoder_counts`, and `coarse_encoder`
-    `mcu.link_check = "on"`.
+    `encoder_counts_missing` advises `mcu.encoder_counts`, `coarse_encoder` `mcu.link_check = "on"`,
+    and `not_calibrated` `acsard calibrate`.
     """
     sender: str = ""
     """Public name of the selected sender of `source`; empty while no sender is selected.
@@ -666,8 +666,8 @@ class SwitchOff(Message, frozen=True):
     """Also lend the serial port to another program, if the robot rests. A robot that is stopped or
     in fault stays so, and only the port is closed. It opens again at the next `activate` that names
     the number of this loan, or that is not refused; until then, a second program is refused. The
-    borrower may move the robot, so the pose is unknown until `reset_odometry` or `set_pose`: its
-    variances are 1e9."""
+    borrower may move the robot, so the pose is less certain after it, by up to 10 m and 3.2 rad,
+    until `reset_odometry` or `set_pose`."""
 
 
 class Settings(Message, frozen=True):

@@ -30,6 +30,7 @@ class Snapshot(Struct, frozen=True):
     bumper: Reason | None = None  # why one counts as pressed
     battery: BatteryStatus | None = None  # None if never reported
     board: dict[str, str] = {}  # last values of its status lines, and their age in `age_s`, s
+    counts_figures: str = ""  # the angles by counts and by speeds that contradict each other
     check: str = "plain"  # form of the serial lines
     unanswered: bool = False  # more than 2 % of the lines
     missed_last_minute: int = 0  # control periods without a step

@@ -95,4 +95,5 @@ def _warnings(state: RobotState) -> Iterator[StateWarning]:
     if state.wheel_fault:
         yield StateWarning("wheel", "wheel fault", state.wheel_fault)
     if warning := CODES.get(state.pose_doubt):
-        yield StateWarning("pose", "pose doubtful", f"{warning.text} {warning.advice}")
+        brief = "not calibrated" if state.pose_doubt == "not_calibrated" else "pose doubtful"
+        yield StateWarning("pose", brief, f"{warning.text} {warning.advice}")

@@ -39,12 +39,19 @@ class ConsistencyChecks(Struct):
         return self.gyro.status if odometry.gyro else GyroStatus()
 
     def check_line(
-        self, model: ErrorModel, line: Line, rolled: Wheels4, seconds: Seconds, *, known: bool
+        self,
+        model: ErrorModel,
+        line: Line,
+        rolled: Wheels4,
+        seen: Wheels4,
+        seconds: Seconds,
+        *,
+        known: bool,
     ) -> None:
         """Check a line, and set `turn`, `slips` and `events`.
 
         The wheels `rolled` by these angles, rad, in `seconds` since the previous plausible line;
-        `known` says that this is their whole motion.
+        `known` says that this is their whole motion, and `seen` are those that judge the wheels.
         """
         wheels, gyro, turn, by_gyro, event = self.wheels, self.gyro, None, None, None
         if model.claims is not None:
@@ -56,11 +63,7 @@ class ConsistencyChecks(Struct):
         self.turn = turn
         feedback = model.feedback
         wheels.add(
-            rolled, line.speeds, seconds, by_gyro, feedback, model.kinematics, model.wheel_count
+            seen, line.speeds, seconds, by_gyro, feedback, model.kinematics, model.wheel_count
         )
-        self.slips = (
-            wheels.slips
-            or (turn is not None and turn.slips)
-            or not feedback.encoders  # the speeds are commands
-        )
+        self.slips = wheels.slips or (turn is not None and turn.slips)
         self.events = wheels.events if event is None else (event, *wheels.events)

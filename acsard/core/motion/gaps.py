@@ -3,6 +3,7 @@
 Each wheel rolls by its encoder counts, by whole counts recovered from the speeds, or by speed times
 time. A time for which no plausible line speaks is filled with the trapezoid of the speeds at its
 ends, if it is shorter than `MAX_FILLED_GAP_S`. Otherwise its motion is unknown, and the pose stays.
+No sound line is repaired: a speed that may be false is used, and doubted as much.
 """
 
 from __future__ import annotations
@@ -15,12 +16,11 @@ from acsard.core.link.coarse_encoders import MIN_COUNT_S
 from acsard.core.link.feedback import MAX_FILLED_GAP_S, Line
 from acsard.core.values import RadPerS, Seconds, Wheels4
 
-# By the number of driven wheels: a line for more than this is judged like a gap. A false speed of
-# one wheel is a quarter of the motion, or half of it.
-LONG_S = {4: 0.06, 2: 0.03}
+# A line for more than this is judged like a gap, because a false speed in it is worth as much.
+LONG_S = 0.03
 
-# By which a sound speed leaves the range from its last one to its command: a share, by slopes and
-# overshoot, and a count of an encoder with unknown counts.
+# By which a sound speed leaves the range of the known ones: a share, by slopes and overshoot, and a
+# count of an encoder with unknown counts.
 ROUGHLY, ASSUMED_COUNT = 0.3, math.tau / 400
 
 AT_REST: Wheels4 = (0.0, 0.0, 0.0, 0.0)
@@ -52,15 +52,18 @@ class Rolled(Struct, frozen=True, gc=False):
     seconds: Seconds  # in which they rolled them
     filled: Seconds  # part of `seconds` for which no line speaks
     unknown: Seconds  # in addition to `seconds`
+    vague: Seconds = 0.0  # part of `seconds` that the last line may not cover
     alone: Wheels4 = AT_REST  # part of `angles` that one speed of one line says, and nothing else
 
 
-def rolled_over(skipped: Skipped, line: Line, before: Wheels4, commanded: Wheels4 | None) -> Rolled:
+def rolled_over(
+    skipped: Skipped, line: Line, before: Wheels4, commanded: Wheels4, independent: int
+) -> Rolled:
     """Return the angles since the last plausible line, which had the speeds `before`, rad/s.
 
-    `commanded` is None if there are two wheels on a side.
+    `independent` is the number of driven wheels.
     """
-    speeds = _confirmed(before, line.speeds.as_tuple())
+    speeds = line.speeds.as_tuple()
     if line.turned is not None:
         seconds, filled, unknown, angles = line.dt, 0.0, 0.0, line.turned
     else:
@@ -75,34 +78,21 @@ def rolled_over(skipped: Skipped, line: Line, before: Wheels4, commanded: Wheels
     if filled:
         angles = plus(angles, times(plus(before, speeds), filled / 2))
     alone = AT_REST
-    if commanded is not None and line.by_counts is None:
+    if line.by_counts is None:
         count = (line.count or ASSUMED_COUNT) / max(line.dt, MIN_COUNT_S)
-        beyond = _beyond(before, speeds, commanded, count)
+        partner = speeds[::-1] if independent == len(speeds) else before
+        beyond = _beyond(speeds, (before, commanded, partner), count)
         alone = times(beyond, line.dt - line.bridged + filled / 2)
-    return Rolled(angles, seconds + filled, filled, unknown, alone)
+    return Rolled(angles, seconds + filled, filled, unknown, line.vague, alone)
 
 
-def _confirmed(before: Wheels4, after: Wheels4) -> Wheels4:
-    # Motion changes both wheels of a side alike, damage one of them. In a usual line it matters
-    # little; here, take the median of each wheel, the other one of its side and its last speed. Of
-    # two wheels, it is the reported speed: the rear one says the same.
-    fr, fl, rl, rr = after
-    was_fr, was_fl, was_rl, was_rr = before
-    return (
-        sorted((fr, rr, was_fr))[1], sorted((fl, rl, was_fl))[1],
-        sorted((rl, fl, was_rl))[1], sorted((rr, fr, was_rr))[1],
-    )  # fmt: skip
-
-
-def _beyond(before: Wheels4, after: Wheels4, commanded: Wheels4, count: RadPerS) -> Wheels4:
-    # A wheel turns at a speed between its last one and its command, roughly and but for a count. If
-    # it is alone on its side, no other value outvotes a damaged one far beyond both: the pose takes
-    # it, and doubts it as much.
+def _beyond(speeds: Wheels4, known: tuple[Wheels4, ...], count: RadPerS) -> Wheels4:
+    # A wheel turns at a speed between its last one, its command, and that of the other wheel of its
+    # side, roughly and but for a count.
     found = []
-    for was, now, wish in zip(before, after, commanded, strict=True):
-        low, high = sorted((was, wish))
-        beyond = now - min(max(now, low), high)
-        usual = ROUGHLY * max(abs(now), abs(was), abs(wish)) + count
+    for now, *others in zip(speeds, *known, strict=True):
+        beyond = now - min(max(now, min(others)), max(others))
+        usual = ROUGHLY * max(abs(now), *map(abs, others)) + count
         found.append(beyond if abs(beyond) > usual else 0.0)
     fr, fl, rl, rr = found
     return fr, fl, rl, rr

@@ -2,8 +2,8 @@
 
 Only the bias is learned, while the robot rests. The wheels give the heading until the gyro has
 turned as they do (`agreement.py`), while it is silent, and if it hangs, from the first sample on
-that it repeated. If the two turns differ by more than both claim, the gyro is used and their
-difference becomes uncertainty of the heading, because wheels may slip.
+that it repeated. If the two turns contradict each other, the gyro is used and their difference
+becomes uncertainty of the heading, because wheels may slip.
 """
 
 from __future__ import annotations
@@ -67,8 +67,7 @@ STATUS_TEXTS: dict[GyroDoes, str] = {
     "hangs": "the gyro repeats one rate exactly, so it hangs: the heading comes from the wheels",
     "disagrees": "gyro and wheels measure different turns: the heading is the gyro's, and its "
     "uncertainty includes the difference. Do the wheels slip, has the gyro's scale or bias "
-    "changed? If the track is not calibrated, run acsard calibrate, or set "
-    "odometry.wheel_separation_multiplier_std to how wrong it may be",
+    "changed? If the track is not calibrated, run acsard calibrate",
     "reversed": "the gyro is not used, because it reports a left turn of the robot as a right "
     "turn: check how the gyro is mounted",
     "in degrees": "the gyro is not used, because its rate is 57 times too high: it sends degrees "

@@ -15,17 +15,26 @@ import math
 
 from msgspec import Struct, field
 
-from acsard.core.link.feedback import Line
+from acsard.core.link.feedback import MAX_FILLED_GAP_S, Line
 from acsard.core.motion.consistency import ConsistencyChecks
 from acsard.core.motion.gaps import AT_REST, LONG_S, Rolled, Skipped, plus, rolled_over, times
 from acsard.core.motion.gyro import REST_S
 from acsard.core.motion.kinematics import on_arc
-from acsard.core.motion.uncertainty import MISSED_STD, UPDATE_S, ErrorModel, Path, Uncertainty
+from acsard.core.motion.uncertainty import (
+    MISSED_STD,
+    UPDATE_S,
+    ErrorModel,
+    Path,
+    Uncertainty,
+    pushed,
+)
 from acsard.core.values import (
+    NS_PER_S,
     REST,
     STILL,
     Estimate,
     Metres,
+    Ns,
     Pose,
     Rad,
     Seconds,
@@ -33,6 +42,8 @@ from acsard.core.values import (
     Wheels4,
     WheelSpeeds,
 )
+
+RECENT_S = 2.0  # within which a wheel that is to be doubted is found out
 
 
 class Odometry(Struct):
@@ -45,11 +56,13 @@ class Odometry(Struct):
     speeds: WheelSpeeds = STILL  # in the last line
     positions: Wheels4 = AT_REST  # of the wheels, rad
     travelled: Metres = 0.0  # since the daemon started, forwards plus backwards
+    recent: Metres = 0.0  # the same, in about the last `RECENT_S`
     skipped: Skipped = field(default_factory=Skipped)
     held: Wheels4 = AT_REST  # rad at rest; for the pose beyond two counts, or in a drive
     rested: Seconds = math.inf  # of zero speeds, without gaps
-    # The pose was set after the last line: a part of the motion since that line came before it.
-    was_set: bool = False
+    # The pose was set then, after the last line: a part of the motion since that line came before.
+    set_ns: Ns = 0
+    late: Twist = REST  # m and rad by `Line.late`, since the last update
     state: tuple[bool, bool, bool] = (True, False, False)  # at rest, slips, by a gyro
     gaps: int = 0  # with unknown motion
     unknown: Seconds = 0.0  # in these
@@ -64,12 +77,12 @@ class Odometry(Struct):
         ms = {"gap_ms": round(1e3 * self.unknown), "gaps_filled_ms": round(1e3 * self.filled)}
         return {name: count for name, count in ({"gaps": self.gaps} | ms).items() if count}
 
-    def set_pose(self, pose: Pose, model: ErrorModel) -> None:
+    def set_pose(self, pose: Pose, model: ErrorModel, at_ns: Ns) -> None:
         """Set the pose of base_link in odom, with the uncertainty of an initial pose."""
         self.positions, self.held = plus(self.positions, self.held), AT_REST
         self.pose = Pose(pose.x, pose.y, math.remainder(pose.yaw, math.tau))
         self.path, self.uncertainty = Path(), Uncertainty.initial(model, self.pose)
-        self.was_set = True
+        self.set_ns = at_ns
 
     def fold(self, line: Line, checks: ConsistencyChecks, model: ErrorModel) -> Estimate:
         """Advance the pose by one plausible line, and return the new estimate.
@@ -79,11 +92,10 @@ class Odometry(Struct):
         """
         speeds, wheels, gap = line.speeds, checks.wheels, None
         reported, seconds = speeds.as_tuple(), line.dt
-        if line.bridged or line.gap or self.skipped.lines or seconds > LONG_S[model.independent]:
-            commanded = None
-            if model.independent == 2:
-                commanded = (wheels.commanded or STILL).as_tuple()
-            gap = rolled_over(self.skipped, line, self.speeds.as_tuple(), commanded)
+        if line.bridged or line.gap or line.vague or self.skipped.lines or seconds > LONG_S:
+            commanded = (wheels.commanded or STILL).as_tuple()
+            before = self.speeds.as_tuple()
+            gap = rolled_over(self.skipped, line, before, commanded, model.independent)
             self.skipped = Skipped()
             rolled, seconds = gap.angles, gap.seconds
         else:
@@ -91,10 +103,13 @@ class Odometry(Struct):
         # Counts are valid even after a silence: the wheels turned by them in its time, too.
         whole = seconds if line.turned is None else seconds + line.gap
         seen = rolled
-        if gap and gap.filled and model.independent == 2 and line.turned is None:
-            # No second wheel of its side confirms a speed behind a silence, the next line does.
+        if line.turned is not None and not line.count:
+            seen = times(reported, seconds)  # the counts seem wrong, which is no fault of a wheel
+        elif gap and gap.filled and line.turned is None:
+            # The next line confirms a speed behind a silence.
             seen = times(self.speeds.as_tuple(), seconds)
-        checks.check_line(model, line, seen, whole, known=gap is None or not gap.unknown)
+        known = gap is None or not gap.unknown
+        checks.check_line(model, line, rolled, seen, whole, known=known)
         turn, slips = checks.turn, checks.slips
 
         believed = wheels.believed(reported) if wheels.excludes else reported
@@ -113,6 +128,7 @@ class Odometry(Struct):
         if turn is not None:
             angle, angular, variance = turn.angle, turn.rate, turn.variance
         self.travelled += abs(distance)
+        self.recent = (self.recent + abs(distance)) * RECENT_S / (RECENT_S + seconds)
         last, self.twist, self.speeds = self.twist, Twist(linear, angular), speeds
 
         pose, path, uncertainty = self.pose, self.path, self.uncertainty
@@ -121,7 +137,7 @@ class Odometry(Struct):
         if due:
             uncertainty.update(model, pose, path, slips=self.state[1], by_gyro=self.state[2])
             self.state = state
-        share = 0.5 if self.was_set else 1.0
+        share = 0.5 if self.set_ns else 1.0
         way, turned = share * distance, share * angle
         dx, dy, yaw = on_arc(pose.yaw, way, turned)
         self.pose = Pose(pose.x + dx, pose.y + dy, yaw)
@@ -130,21 +146,31 @@ class Odometry(Struct):
         )
         # A gap is no period of the lines.
         uncertainty.seconds += seconds - (gap.filled if gap and model.independent == 2 else 0.0)
+        if line.late:
+            self.late = Twist(
+                self.late.linear + linear * line.late, self.late.angular + angular * line.late
+            )
         doubts = wheels.possible_motion(rolled)
         due |= line.doubt is not None or (turn is not None and turn.doubt != 0.0)
-        if due or gap or doubts or self.was_set or uncertainty.seconds >= UPDATE_S:
+        if due or gap or doubts or self.set_ns or uncertainty.seconds >= UPDATE_S:
             uncertainty.update(model, self.pose, self.path, slips=slips, by_gyro=turn is not None)
             rate_variance = None if turn is None else turn.rate_variance
             if at_rest:
                 uncertainty.set_rest(model, self.rested, slips, rate_variance)
             else:
-                uncertainty.set_twist(model, self.twist, slips, rate_variance)
+                uncertainty.set_twist(model, self.twist, line.step, slips, rate_variance)
             heading = yaw - turned / 2
-            if self.was_set:
-                self.was_set = False
+            if self.set_ns:
                 uncertainty.doubt((distance / 2) ** 2, (angle / 2) ** 2, 0.0, heading)
-            if gap and not (rested and line.driven <= 0.0):
-                self._doubt_gap(gap, last, turn is not None, heading, model)
+            if gap:
+                at_ns = line.at.mono_ns
+                rests = rested and at_rest and line.driven <= 0.0
+                self._doubt_gap(gap, last, at_ns, rests, turn is not None, heading, model)
+            self.set_ns = 0
+            if self.late != REST:
+                angle = 0.0 if turn is not None else self.late.angular
+                uncertainty.miss("gap", self.late.linear, angle, heading)
+                self.late = REST
             if line.doubt is not None:
                 distance, angle = model.kinematics.moved(line.doubt)
                 uncertainty.miss("gap", distance, 0.0 if turn is not None else angle, heading)
@@ -154,8 +180,9 @@ class Odometry(Struct):
                 distance, angle = model.kinematics.moved(angles)
                 angle = 0.0 if turn is not None else angle
                 uncertainty.miss(side, MISSED_STD * distance, MISSED_STD * angle, heading)
-                # With a turn that was missed, too, the distance may have been to any side.
-                aside = (MISSED_STD * distance) ** 2 * min(1.0, angle**2)
+                # With a turn that was missed, too, the distance may have been to any side, and so
+                # the way in which it was missed.
+                aside = (MISSED_STD * (abs(distance) + self.recent)) ** 2 * min(1.0, angle**2)
                 uncertainty.doubt(aside, 0.0, aside, heading)
         return Estimate(
             line.at, self.pose, self.twist, uncertainty.covariance, uncertainty.twist,
@@ -170,29 +197,43 @@ class Odometry(Struct):
         return rolled
 
     def _doubt_gap(
-        self, gap: Rolled, before: Twist, by_gyro: bool, heading: Rad, model: ErrorModel,
-    ) -> None:  # fmt: skip
+        self,
+        gap: Rolled,
+        before: Twist,
+        at_ns: Ns,
+        rests: bool,
+        by_gyro: bool,
+        heading: Rad,
+        model: ErrorModel,
+    ) -> None:
         after, uncertainty, filled, unknown = self.twist, self.uncertainty, gap.filled, gap.unknown
         linear, angular = before.linear - after.linear, before.angular - after.angular
         turns = 0.0 if by_gyro else 1.0  # a gyro misses no turn
         if gap.alone != AT_REST:
             distance, angle = model.kinematics.moved(gap.alone)
             uncertainty.miss("gap", -distance, -turns * angle, heading)
-        if filled:
-            self.filled += filled
-            # The speed may have changed at the begin of the gap, or at its end, and the next time
-            # alike: a robot that stops in each silence always stops as late.
-            late = filled / 3
-            uncertainty.miss("gap", linear * late, turns * angular * late, heading)
-            along, yaw = model.in_gap(filled, uncertainty.period)
-            uncertainty.doubt(along, turns * yaw, 0.0, heading)
+        # The speed may have changed at the begin of the lost time, or at its end, and the next time
+        # alike: a robot that stops in each silence always stops as late.
+        late = filled / 3 + gap.vague / 2
+        uncertainty.miss("gap", linear * late, turns * angular * late, heading)
+        self.filled += filled
+        for seconds in (filled, gap.vague):
+            if seconds:
+                along, yaw = model.in_gap(seconds, uncertainty.period, rests)
+                uncertainty.doubt(along, turns * yaw, 0.0, heading)
         if unknown:
             self.gaps += 1
             self.unknown += unknown
-            half, (along, yaw) = unknown / 2, model.in_gap(unknown, uncertainty.period)
+            if self.set_ns:  # the pose was set in the gap
+                unknown = max(0.0, min(unknown, (at_ns - self.set_ns) / NS_PER_S))
+            half, (along, yaw) = (
+                min(unknown, MAX_FILLED_GAP_S) / 2,
+                model.in_gap(unknown, uncertainty.period, rests),
+            )
             distance = half * (before.linear + after.linear)
             angle = half * (before.angular + after.angular)
             uncertainty.miss("gap", distance, turns * angle, heading)
             # The motion may be an arc to either side.
             aside = (distance**2 + along) * min(1.0, (angle**2 + yaw) / 4)
-            uncertainty.doubt(along, turns * yaw, aside, heading)
+            away, turned = pushed(unknown - MAX_FILLED_GAP_S)
+            uncertainty.doubt(along + away, turns * (yaw + turned), aside + away, heading)

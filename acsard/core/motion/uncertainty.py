@@ -21,6 +21,7 @@ from typing import Literal
 from msgspec import Struct, field
 
 from acsard.core.config.settings import FeedbackConfig, LimitsConfig, OdometryConfig
+from acsard.core.link.coarse_encoders import LARGEST_JUMP
 from acsard.core.link.feedback import MAX_FILLED_GAP_S
 from acsard.core.motion.agreement import claims
 from acsard.core.motion.kinematics import Kinematics
@@ -31,6 +32,7 @@ from acsard.core.values import (
     Pose,
     PoseCovariance,
     Rad,
+    RadPerS,
     Seconds,
     Twist,
     TwistVariances,
@@ -52,6 +54,10 @@ SPEED_RESOLUTION = 0.01  # rad/s: a line has two decimals
 LATERAL_VARIANCE = 1e-3  # m2/s2 sideways, which wheels do not measure, while the robot moves
 MIN_TWIST_VARIANCE = 1e-8  # filters that use the published twist treat less as an error
 SLIP_FACTOR = 100.0  # on the variances of a step and of the twist while the wheels slip
+
+# Beyond `MAX_FILLED_GAP_S` without a line, the robot rests, and a person may push and turn it.
+PUSH_SPEED, PUSH_TURN = 1.0, 0.5  # m/s and rad/s
+MOST_AWAY, MOST_TURNED = 10.0, 3.2  # m and rad: then it may be anywhere near, in any direction
 
 # Deviation of a motion that the pose has missed with the probability 1/2.
 MISSED_STD = math.sqrt(0.5)
@@ -115,12 +121,15 @@ class ErrorModel:
         self.skid = odometry.yaw_variance_per_radian
 
         ratio, gyro = odometry.wheel_radius_ratio_std, odometry.gyro_scale_std
-        share = odometry.wheel_separation_multiplier_std / kinematics.multipliers[2]
+        share = odometry.track_std(independent) / kinematics.multipliers[2]
         scale = (odometry.distance_scale_std, 0.0, 0.0, 0.0)
         # One radius is larger by half of the ratio's error, the other smaller.
         longer, none = ratio * track / 4, NO_EFFECT
         by_wheels = [(0.0, longer, ratio / track, 0.0), (0.0, 0.0, 0.0, -share), scale, none]
         by_gyro = [(0.0, longer, 0.0, 0.0), none, scale, (0.0, 0.0, 0.0, gyro)]
+        if not feedback.encoders:  # the lines repeat the commands, and the robot may rest
+            by_wheels = [none, (0.0, 0.0, 0.0, 1.0), (1.0, 0.0, 0.0, 0.0), none]
+            by_gyro[SCALE] = (1.0, 0.0, 0.0, 0.0)
         missed = [none] * len(MISSED)
         self.effects: tuple[list[Effect], list[Effect]] = by_wheels + missed, by_gyro + missed
         self.bending = [k for k in PARAMETERS if any(by_wheels[k]) or any(by_gyro[k])]
@@ -149,23 +158,32 @@ class ErrorModel:
             both * (right - left),
         )
 
-    def in_gap(self, seconds: Seconds, period: Seconds) -> tuple[float, float]:
-        """Return the variances of the distance, m2, and the turn, rad2, in a gap of a moving robot.
+    def in_gap(self, seconds: Seconds, period: Seconds, rests: bool) -> tuple[float, float]:
+        """Return the variances of the distance, m2, and the turn, rad2, that no line covers.
 
         Within the limits, a motion between two speeds differs by at most a t^2 / 4 from the
-        trapezoid. The rounding of both speeds is alike for both wheels of a side.
+        trapezoid. The rounding of both speeds is alike for both wheels of a side, and none if the
+        robot `rests` before and after.
         """
-        speed, acceleration = self.speed, self.acceleration
+        speed, acceleration, quantum = self.speed, self.acceleration, 0.0
         short = min(seconds, MAX_FILLED_GAP_S)  # then the robot was stopped
-        quantum = 2 * (self.unsettled / 2 / period * short) ** 2
-        if self.independent == 2:
-            # A count is missed in the gap, too: in one lost line, it is five times the above. With
-            # four wheels, the factor of a slip behind a gap covers it.
-            count = self.unsettled / 2
-            quantum = (count / period * short + count) ** 2 + count**2
+        if not rests:
+            quantum = 2 * (self.unsettled / 2 / period * short) ** 2
+            if self.independent == 2:
+                # A count is missed in the gap, too: in one lost line, it is five times the above.
+                # With four wheels, the factor of a slip behind a gap covers it.
+                count = self.unsettled / 2
+                quantum = (count / period * short + count) ** 2 + count**2
         along = min(acceleration.linear * short / 4, speed.linear) * short
         yaw = min(acceleration.angular * short / 4, speed.angular) * short
         return along**2 + self.of_speed[0] * quantum, yaw**2 + self.of_speed[1] * quantum
+
+
+def pushed(seconds: Seconds) -> tuple[float, float]:
+    """Return the variances of position, m2, and heading, rad2, if nobody watched the robot rest."""
+    seconds = max(0.0, seconds)
+    away, turned = min(PUSH_SPEED * seconds, MOST_AWAY), min(PUSH_TURN * seconds, MOST_TURNED)
+    return away * away, turned * turned
 
 
 class Path(Struct, frozen=True, gc=False):
@@ -216,10 +234,6 @@ class Uncertainty(Struct):
         columns = [ORIGIN] * CAUSES
         return cls(model.start, model.start, Bend(model.start, columns, pose), columns, pose)
 
-    def lose(self) -> None:
-        """Make the pose unknown until it is set."""
-        self.p = self.covariance = UNKNOWN_POSE
-
     def update(
         self, model: ErrorModel, pose: Pose, path: Path, *, slips: bool, by_gyro: bool
     ) -> None:
@@ -230,7 +244,7 @@ class Uncertainty(Struct):
         if self.seconds:
             self.period = max(MIN_PERIOD_S, self.seconds / (path.lines - self.path.lines))
         self.pose, self.path, self.seconds = pose, path, 0.0
-        if not (distance or turn or dx or dy) or self._is_lost():
+        if not (distance or turn or dx or dy):
             return
         heading = pose.yaw - turn / 2
         c, s = math.cos(heading), math.sin(heading)
@@ -272,18 +286,15 @@ class Uncertainty(Struct):
 
     def doubt(self, along: float, yaw: float, aside: float, heading: Rad) -> None:
         """Add variances of distance, m2, turn, rad2, and of the position sideways, m2."""
-        if not self._is_lost():
-            c, s = math.cos(heading), math.sin(heading)
-            self.p = added(added(self.p, along, yaw, 0.0, c, s), aside, 0.0, 0.0, -s, c)
-            self._publish()
+        c, s = math.cos(heading), math.sin(heading)
+        self.p = added(added(self.p, along, yaw, 0.0, c, s), aside, 0.0, 0.0, -s, c)
+        self._publish()
 
     def miss(self, cause: Missed, distance: Metres, turn: Rad, heading: Rad) -> None:
         """Add a motion that the pose may have missed, as standard deviations.
 
         Those of one cause add up, and those of opposite directions cancel.
         """
-        if self._is_lost():
-            return
         i = MISSED[cause]
         x, y, yaw = self.columns[i]
         c, s = math.cos(heading), math.sin(heading)
@@ -291,14 +302,19 @@ class Uncertainty(Struct):
         self.columns[i] = x + c * distance, y + s * distance, yaw + turn
         self._publish()
 
-    def set_twist(self, model: ErrorModel, twist: Twist, slips: bool, gyro: float | None) -> None:
+    def set_twist(
+        self, model: ErrorModel, twist: Twist, step: RadPerS, slips: bool, gyro: float | None
+    ) -> None:
         """Set the variances of a moving robot's twist, with those of the gyro's rate, rad2/s2.
+
+        `step` is the change of a speed by one count, if the counts are not declared; inf: unknown.
 
         A pose that is integrated from twists is as uncertain as that of the odometry. The errors of
         parameters and of the quantization of the speeds come on top.
         """
         linear, angular, period = twist.linear, twist.angular, self.period
-        quantum = max(SPEED_RESOLUTION, model.count / period) ** 2
+        count = model.count / period if model.count else min(step, LARGEST_JUMP / period)
+        quantum = max(SPEED_RESOLUTION, count) ** 2
         along, yaw, _ = model.noise(linear, angular, abs(angular))
         along, yaw = along / period, yaw / period
         for of_distance, of_turn, turn_of_distance, turn_of_turn in model.effects[0]:
@@ -323,9 +339,6 @@ class Uncertainty(Struct):
             min(factor * lateral, most),
             min(max(factor * angular if gyro is None else gyro, least), most),
         )
-
-    def _is_lost(self) -> bool:
-        return self.covariance == UNKNOWN_POSE
 
     def _beyond_play(self, model: ErrorModel, turn: Rad) -> Rad:
         # The sum of |turn| of a straight drive would count the play as turning, and make the
