@@ -64,6 +64,7 @@ def test_a_planted_fault_is_named(fault: str) -> None:
     assert named(fault, refusal(planted(fault, "gyro", 3)))
 
 
+@pytest.mark.slow
 @pytest.mark.nightly
 @pytest.mark.parametrize(("way", "fault"), EVERY)
 def test_each_planted_fault_is_named(way: str, fault: str) -> None:
