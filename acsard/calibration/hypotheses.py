@@ -41,6 +41,7 @@ LATE_S, NOTED_LATE_S = 0.9, 0.1
 
 FOLLOWS = 0.3  # share of a sensor's motion that the wheels need not explain
 POOR, POORER = 0.15, 3.0  # share, and in that of the best sensor, of one that is left out
+ALIAS = 0.02  # share, by which a possible robot may explain less than an impossible one
 CLEARER, CLEAR = 0.5, 0.01  # of the unexplained share: factor and margin of a better row
 TOO_GOOD = 2e-3
 LEAST_TRACK = 1e-3
@@ -106,6 +107,10 @@ class Match(Struct, frozen=True):
     @property
     def given(self) -> bool:
         return self.sides == "given" and self.track > 0
+
+    @property
+    def robot(self) -> bool:
+        return ROBOTS[0] < abs(self.track) < ROBOTS[1]
 
 
 def examined(
@@ -213,6 +218,12 @@ def matched(sensor: str, runs: Sequence[Run], base: Base) -> Match:
     found = [seen.match(*row) for row in (("given", -1), ("one sign", 1), ("one sign", -1))]
     best = min(found, key=lambda match: match.unexplained)
     if best.unexplained > CLEARER * given.unexplained - CLEAR:
+        possible = [match for match in (given, *found) if match.robot]
+        # Turns of 90 deg on the spot look like turns of 270 deg to the other side.
+        if given.follows and not given.robot and possible:
+            best = min(possible, key=lambda match: match.unexplained)
+            if best.unexplained < given.unexplained + ALIAS:
+                return replace(best, as_given=given.unexplained)
         if given.follows and abs(given.delay) < LATE_S:
             return given
         rows = product(("given", "angles"), (1, -1))
@@ -232,11 +243,7 @@ def _facts(runs: Sequence[Run], matches: Mapping[str, Match], base: Base) -> Ite
         np.concatenate([np.diff(getattr(run, side)) for run in runs]) for side in ("left", "right")
     )
     rolled = float(np.abs(left).sum() + np.abs(right).sum())
-    if np.abs(left - right).sum() < TWICE * rolled:
-        yield (
-            "left and right are the same in every row, although the robot turns: the log has one "
-            "side twice. Record the wheels of both sides"
-        )
+    same = np.abs(left - right).sum() < TWICE * rolled
     back = -float(np.minimum(left, 0.0).sum() + np.minimum(right, 0.0).sum())
     for sensor in matches:
         seen = Places(sensor, runs, base) if sensor == "positions" else Turns(sensor, runs, base)
@@ -244,8 +251,13 @@ def _facts(runs: Sequence[Run], matches: Mapping[str, Match], base: Base) -> Ite
             yield (
                 "the wheels never turn backwards in this log, and only with signs that it does not "
                 f"have they explain {NAMES[sensor]}: encoders with one channel, or a sign that was "
-                "lost. Record speeds with their sign"
+                "lost. Record speeds with their sign" + (", and not one side twice" if same else "")
             )
+    if same:
+        yield (
+            "left and right are the same in every row, although the robot turns: the log has one "
+            "side twice. Record the wheels of both sides"
+        )
     for side, other in (("left", "right"), ("right", "left")):
         rolled = sum(float(np.abs(np.diff(getattr(run, other))).sum()) for run in runs)
         alone, begin, end = max(_alone(run, side, other) for run in runs)
@@ -307,12 +319,15 @@ def _sized(matches: Mapping[str, Match], drive: DriveConfig) -> Iterator[str]:
 
     def possible(
         tracks: tuple[float, float], sizes: tuple[float, float], *, speeds: float = 1.0,
-        places: float = 1.0, turns: Mapping[str, float] = {},
+        places: float = 1.0, turns: Mapping[str, float] = {}, alias: bool = False,
     ) -> bool:  # fmt: skip
         return all(
-            tracks[0] < track / speeds * turns.get(sensor, 1.0) < tracks[1]
-            and (sensor != "positions" or sizes[0] < size * speeds / places < sizes[1])
-            for sensor, track, size in seen
+            (alias and sensor == "positions")
+            or tracks[0] < track / speeds * turns.get(sensor, 1.0) < tracks[1]
+            for sensor, track, _ in seen
+        ) and all(
+            sensor != "positions" or sizes[0] < size * speeds / places < sizes[1]
+            for sensor, _, size in seen
         )
 
     if possible(ROBOTS, SIZES):
@@ -330,6 +345,10 @@ def _sized(matches: Mapping[str, Match], drive: DriveConfig) -> Iterator[str]:
     causes += [words for k, words in PLACES.items() if possible(*check, places=k)]
     causes += [f"{NAMES[sensor]} is in deg, not in rad" for sensor, _, _ in seen
                if possible(*check, turns={sensor: 180 / math.pi})]  # fmt: skip
+    # Turns of 90 deg on the spot show no track by positions, but their size is right.
+    causes = causes or [
+        words for k, words in speeds.items() if possible(*check, speeds=k, alias=True)
+    ]
     yield f"{' and '.join(facts)}: " + (
         ", or ".join(causes)
         or "is t in s, are the speeds of the wheels and yaw_rate in rad/s, x "
