@@ -17,7 +17,8 @@ import numpy as np
 import zenoh
 
 from acsard.bus.subscription import Subscription, encoded
-from acsard.calibration.fit import ASIDE, Base
+from acsard.calibration.fit import ASIDE
+from acsard.calibration.geometry import Base
 from acsard.calibration.log import APPLIED, Floats, LogError, Notes, Run, run_of
 from acsard.calibration.plan import Leg, Move
 from acsard.client.connection import Connection

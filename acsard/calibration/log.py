@@ -37,7 +37,8 @@ COLUMNS = {
     "yaw": "rad", "applied_linear": "m/s", "applied_angular": "rad/s", "run": "a name",
 }  # fmt: skip
 
-MIN_ROWS, MIN_RUN_S = 8, 2.0
+MIN_ROWS, MIN_RUN_S = 8, 1.5
+MAX_STEP_S, MAX_SECONDS = 2.0, 6 * 3600.0  # between rows of the wheels, and of a log
 BACK_S = 1.0  # a jump back of the time by which a new run begins
 GAP_S, GAP_PERIODS = 1.0, 8.0  # a gap of the wheels that ends a run: longer than both
 MAX_RUNS = 1000  # names in the column `run`
@@ -46,8 +47,10 @@ STANDSTILL_SPEED = 0.02  # rad/s, up to which a wheel stands
 REST_S = 0.4  # over which the wheels must hardly roll: an encoder at rest may rock between counts
 REST_ROLL = 0.03  # rad
 
-# A cell that is `SPIKE` times as large as all but 2 % of the moving cells is a wrong sample.
-SPIKE, SPIKE_QUANTILE = 10.0, 0.98
+# A value stands apart if it is far from both neighbours, which are near to each other. Single ones
+# are wrong; if there are many, two programs write one column.
+APART, NEAR_SHARE, FAR_SHARES = 5.0, 0.1, 3.0  # of the range of the values
+MAX_APART, STEPS = 0.2, 1.5  # share of the moving values; steps of a coarse encoder
 
 STUCK_S, STUCK_TURN = 1.0, 0.3  # a gyro that repeats one value while the wheels' turn changes, rad
 
@@ -197,7 +200,11 @@ def read(data: bytes) -> Log:
     try:
         columns = table.columns
         for name in [name for name in (*FOUR, *TWO, "yaw_rate") if name in columns]:
-            _without_spikes(table, name)
+            rows = np.flatnonzero(np.isfinite(columns[name]))
+            wild = rows[apart(name, columns[name][rows])]
+            table.notes.add(f"cells of {name} left out, far from those beside them, such as "
+                       f"{columns[name][wild[:1]].sum():g}: {{}}", len(wild))  # fmt: skip
+            columns[name][wild] = math.nan
         columns["left"], columns["right"] = _sides(table)
         runs = []
         for number, name in enumerate(table.names):
@@ -216,6 +223,9 @@ def read(data: bytes) -> Log:
         for note in table.notes.sentences():
             error.add_note(note)
         raise
+    seconds = sum(run.seconds for run in runs)
+    if seconds > MAX_SECONDS:
+        raise LogError(f"the drive lasts {seconds / 3600:.0f} h: is t in s, and not in ms?")
     named = tuple(run if run.name else replace(run, name=str(at)) for at, run in enumerate(runs, 1))
     return Log(named, table.notes.sentences())
 
@@ -289,35 +299,29 @@ def _used(header: Sequence[str]) -> list[str]:
     return used
 
 
-def _without_spikes(table: _Table, name: str) -> None:
-    values = table.columns[name]
-    sizes = np.abs(values)
-    moving = sizes[np.isfinite(sizes) & (sizes > STANDSTILL_SPEED)]
-    if len(moving) < 50:
-        return
-    limit = SPIKE * float(np.quantile(moving, SPIKE_QUANTILE))
-    wild = sizes > limit
-    if wild.any():
-        example = float(values[wild][0])
-        values[wild] = math.nan
-        table.notes.add(f"cells of {name} left out, far above others, such as {example:g}: {{}}",
-                   int(wild.sum()))  # fmt: skip
-    _require_one_series(name, values)
-
-
-def _require_one_series(name: str, values: Floats) -> None:
-    # Refuse a column in which zeros of a second sender alternate with the values of the first.
-    values = values[np.isfinite(values)]
-    if len(values) < 3:
-        return
-    before, middle, after = values[:-2], values[1:-1], values[2:]
-    between = (middle == 0.0) & (before != 0.0) & (np.abs(after - before) < 0.2 * np.abs(before))
-    # A coarse encoder alternates too, but between a few multiples of its step.
-    if between.sum() > 0.2 * (values != 0.0).sum() and len(np.unique(before[between])) > 20:
+def apart(name: str, values: Floats | Complexes) -> Mask:
+    """Return a mask of single values that are wrong. Raise `LogError` if two series alternate."""
+    mask = np.zeros(len(values), dtype=bool)
+    if len(values) < MIN_ROWS:
+        return mask
+    places = np.iscomplexobj(values)
+    sizes = np.abs(values - (np.mean(values) if places else 0.0))
+    usual = float(np.quantile(sizes, 0.95))
+    # A coarse encoder alternates between multiples of its step.
+    step = float(np.quantile(np.abs(values[values != 0]), 0.02)) if values.any() else 0.0
+    away = np.abs(values[1:-1] - (values[2:] + values[:-2]) / 2)
+    alone = away > APART * np.abs(values[2:] - values[:-2])
+    far = max(NEAR_SHARE * usual, 0.0 if places else STEPS * step)
+    moving = (np.maximum(sizes[1:-1], away) > far) | places
+    if (alone & (away > far)).sum() > MAX_APART * max(moving.sum(), 5 * MIN_ROWS):
         raise LogError(
-            f"in column {name}, every other value is 0: two programs write this column, for "
-            "example a joint_state_publisher beside the driver. Record only the driver"
+            f"in {name}, two series of values alternate: every other value is far from those "
+            "beside it, as if two programs or sensors wrote it (a joint_state_publisher beside the "
+            "driver, or two IMUs on one topic). Record only one of them"
         )
+    step = APART * float(np.median(np.abs(np.diff(values))))
+    mask[1:-1] = alone & (away > (max(far, step) if places else FAR_SHARES * usual))
+    return mask
 
 
 def _sides(table: _Table) -> tuple[Floats, Floats]:
@@ -363,6 +367,11 @@ def _split(table: _Table, rows: npt.NDArray[np.int64]) -> list[npt.NDArray[np.in
                 "in seconds with 3 decimals"
             )
         steps = np.diff(times)
+        if float(np.median(steps)) > MAX_STEP_S:
+            raise LogError(
+                f"the rows of the wheels are {float(np.median(steps)):g} s apart, but 1 Hz or more "
+                "is needed: is t in s, and not in ms?"
+            )
         gaps = np.flatnonzero(steps > max(GAP_S, GAP_PERIODS * float(np.median(steps))))
         table.notes.add("a new run begins after a gap in the wheel speeds; number of gaps: {}",
                    len(gaps))  # fmt: skip
@@ -408,6 +417,11 @@ def run_of(name: str, streams: Mapping[str, tuple[Floats, ...]], notes: Notes) -
         integral(gyro_t, rate), place_t - start, x + 1j * y, yaw_t - start, yaw,
         commands[0] - start, np.column_stack(commands[1:]),
     )  # fmt: skip
+    apart("yaw_rate", rate)
+    apart("yaw", np.exp(1j * yaw))
+    wild = apart("x, y", run.place)
+    notes.add("rows of x, y left out, far from those beside them: {}", int(wild.sum()))
+    run = replace(run, place_t=run.place_t[~wild], place=run.place[~wild])
     return _without_repeats(notes, _without_stuck(notes, run, rate))
 
 

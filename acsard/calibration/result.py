@@ -6,15 +6,17 @@ A value is written only if it is better on runs that its fit did not use.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from itertools import combinations
 
 import numpy as np
 from msgspec import Struct
 from rich.console import RenderableType
 
-from acsard.calibration.checks import require_agreement, require_motion
-from acsard.calibration.fit import AGREES, LEFT, RIGHT, TRACK, Errors, Fit, fit
-from acsard.calibration.log import Floats, Log, LogError, TapeReading
+from acsard.calibration.fit import AGREES, Errors, Fit, fit
+from acsard.calibration.geometry import LEFT, RIGHT, TRACK
+from acsard.calibration.hypotheses import NAMES, Match, examined, without
+from acsard.calibration.log import Floats, Log, LogError, Run, TapeReading
 from acsard.calibration.noise import Noise, noise
 from acsard.calibration.response import response_time
 from acsard.core.config.settings import Config
@@ -23,12 +25,23 @@ from acsard.core.formatting import many
 from acsard.core.values import Seconds
 from acsard.terminal.output import table
 
+# Drives beyond these are of another unit.
+MAX_SPEED, MAX_TURNS = 10.0, 1000.0  # m/s, 360 deg
+CONTRADICTION, CONTRADICTIONS = 0.1, 4.0  # of two tracks, as a fraction and in deviations
+ALONE_RUNS = 40  # of many runs, these suffice to compare the tracks by two sensors
+MIN_ROLLED = 20.0  # rad, by the wheels of a log
+DRIVE = (
+    "stand for 3 s, drive 2 m ahead and back, turn three times to each side, slowly and fast, then "
+    "drive curves: 60 s in all"
+)
+
 DIGITS = 5
 MULTIPLIERS = {
     "wheel_separation_multiplier": TRACK, "left_wheel_radius_multiplier": LEFT,
     "right_wheel_radius_multiplier": RIGHT,
 }  # fmt: skip
 TRACK_NAME = "wheel_separation_multiplier"
+SMALL = 0.01  # difference of a track or radius from the configured one
 SHORT = 1.5  # times the configured response time, from which a longer one is written
 MISREAD = 4.0  # deviations of a reading that does not fit the others
 REPORT_M = 10.0  # of driving, for the sentence about noise
@@ -66,17 +79,63 @@ class Result(Struct, frozen=True):
 def calibrate(log: Log, config: Config, source: str) -> Result:
     """Return the calibration of a log. Raises `LogError`, with the notes of the log attached."""
     try:
-        require_motion(log.runs)
-        found = fit(log.runs, config)
-        notes = require_agreement(found, config.drive.wheel_separation)
-        return _result(log, config, source, found, notes)
+        _require_motion(log.runs)
+        runs, matches, notes = examined(log.runs, config.drive)
+        log = Log(tuple(runs), (*notes, *log.notes))
+        _require_one_robot(runs, config, matches)
+        return _require_drive(_result(log, config, source, fit(runs, config, matches)))
     except LogError as error:
         for note in log.notes:
             error.add_note(note)
         raise
 
 
-def _result(log: Log, config: Config, source: str, found: Fit, notes: list[str]) -> Result:
+def _require_motion(runs: Sequence[Run]) -> None:
+    rolled = sum(float(np.abs(np.diff(side)).sum()) for r in runs for side in (r.left, r.right)) / 2
+    if rolled < MIN_ROLLED:
+        raise LogError(f"the wheels roll only {rolled:.1f} rad in this log: {DRIVE}")
+
+
+def _require_drive(result: Result) -> Result:
+    # A drive that no robot makes is one in another unit.
+    fast = result.distance > MAX_SPEED * result.seconds
+    if result.turns > MAX_TURNS or fast:
+        raise LogError(
+            f"by t and the wheels the robot drives {result.distance:.0f} m and {result.turns:.0f} "
+            f"turns in {result.seconds:.0f} s, which no robot does in a calibration: is t in s, "
+            "are the speeds of the wheels in rad/s, and are drive.wheel_radius and "
+            "drive.wheel_separation in m?"
+        )
+    return result
+
+
+def _require_one_robot(runs: Sequence[Run], config: Config, matches: Mapping[str, Match]) -> None:
+    # Sensors that contradict each other are not mixed: each is fitted alone first.
+    if len(matches) < 2:
+        return
+    some = runs[:: 1 + len(runs) // ALONE_RUNS]
+    alone = {}
+    for sensor, match in matches.items():
+        others = [other for other in NAMES if other != sensor]
+        alone[sensor] = fit([without(run, *others) for run in some], config, {sensor: match})
+    values = {
+        sensor: (found.p[TRACK] - (found.p[LEFT] + found.p[RIGHT]) / 2, found.shares[0])
+        for sensor, found in alone.items()
+    }
+    for (a, (track, std)), (b, (other, other_std)) in combinations(values.items(), 2):
+        if abs(track - other) > max(CONTRADICTION, CONTRADICTIONS * math.hypot(std, other_std)):
+            words = " and ".join(
+                f"{math.exp(v) * config.drive.wheel_separation_multiplier:.3f} +- "
+                f"{math.exp(v) * s:.3f} by {NAMES[sensor]}"
+                for sensor, (v, s) in ((a, values[a]), (b, values[b]))
+            )
+            raise LogError(
+                f"{NAMES[a]} and {NAMES[b]} contradict each other: the track is {words}, in wheel "
+                "separations. Leave the column of the wrong sensor out"
+            )
+
+
+def _result(log: Log, config: Config, source: str, found: Fit) -> Result:
     base, p = found.base, found.p
     motion = [base.motion(p, *piece.rolls) for piece in found.pieces]
     configured = np.array([getattr(config.drive, name) for name in MULTIPLIERS])
@@ -90,10 +149,14 @@ def _result(log: Log, config: Config, source: str, found: Fit, notes: list[str])
     settings: dict[str, float] = {}
     decisions = [*_geometry(found, config, settings, shown)]
     misread = _misread(found, [run.name for run in log.runs])
-    decisions += _noise(found, config, settings, shown)
+    if found.better:  # the noise is that of the new geometry
+        decisions += _noise(found, config, settings, shown)
     decisions += _response(log, config, settings)
     if not settings:
-        agrees = found.readings is None or found.readings.now <= AGREES
+        off = np.abs(found.p[[LEFT, RIGHT, TRACK]])
+        agrees = (found.readings is None or found.readings.now <= AGREES) and bool(
+            np.all(off < np.maximum(AGREES * np.sqrt(np.diag(found.covariance)), SMALL))
+        )
         verdict = (
             "Your robot agrees with its configuration" if agrees else "No value is surely better"
         )
@@ -109,7 +172,7 @@ def _result(log: Log, config: Config, source: str, found: Fit, notes: list[str])
         found.turn and Errors(math.degrees(found.turn.now), math.degrees(found.turn.new)),
         found.place, decisions,
         {key: float(f"{value:.{DIGITS}g}") for key, value in settings.items()},
-        (*notes, *log.notes),
+        log.notes,
     )  # fmt: skip
 
 

@@ -21,6 +21,10 @@ CLOCK_S, DRIFT, MAX_SPREAD_S = 1.0, 1e-3, 1.0  # of the clock of a topic
 ALTERNATIONS, APART_RAD = 10, 0.5  # of two series of angles on one topic
 BACK_S = 1.0  # a jump back of the time, which is no change of the order
 AXES = "x", "y", "z"
+KINDS = {
+    "wheels": ["JointState"], "imu": ["Imu"],
+    "positions": ["PoseStamped", "PoseWithCovarianceStamped", "Odometry", "TransformStamped"],
+}  # fmt: skip
 
 Array = Any  # of numpy
 Row = tuple[float, str]  # place in the bag, and the line
@@ -200,11 +204,9 @@ def positions(topic: Topic, up: str, *, yaw: bool) -> Iterable[Row]:
 def pose(message: Any) -> tuple[Sequence[float], Sequence[float]]:
     if hasattr(message, "transform"):
         p, q = message.transform.translation, message.transform.rotation
-    elif hasattr(message, "pose"):
+    else:
         inner = getattr(message.pose, "pose", message.pose)
         p, q = inner.position, inner.orientation
-    else:
-        raise SystemExit(f"{message.__msgtype__} has no pose")
     return (p.x, p.y, p.z), (q.x, q.y, q.z, q.w)
 
 
@@ -221,6 +223,15 @@ def convert(args: argparse.Namespace) -> str:
                 f"{', '.join(sorted({c.topic for c in bag.connections}))}"
             )
         used = [c for c in bag.connections if c.topic in names]
+        for option, kinds in KINDS.items():
+            given = getattr(args, option)
+            for c in used:
+                kind = c.msgtype.rpartition("/")[2]
+                if c.topic in (given if option == "wheels" else [given]) and kind not in kinds:
+                    raise SystemExit(
+                        f"{c.topic} is a topic of type {kind}, but --{option} needs "
+                        f"{' or '.join(kinds)}"
+                    )
         for at, (connection, recorded_ns, data) in enumerate(bag.messages(used)):
             message = bag.deserialize(data, connection.msgtype)
             topics[connection.topic].add(at, recorded_ns, message)

@@ -7,7 +7,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from acsard.calibration.fit import TRACK, Fit, fit
+from acsard.calibration.fit import Fit, fit
+from acsard.calibration.geometry import TRACK
 from acsard.calibration.log import Notes, Run, run_of
 from acsard.core.config.settings import Config
 from tests.unit.calibration_robots import GUIDED, Drive, Floats, Plan, Robot, drive

@@ -178,3 +178,26 @@ def test_a_topic_or_joint_that_is_missing_is_named(tmp_path: Path) -> None:
         converted(directory, *GYRO)
     with pytest.raises(SystemExit, match="no joint wheel; the joints are front_left_wheel_joint"):
         converted(directory, left=["wheel"])
+
+
+def test_a_topic_of_another_type_is_named(tmp_path: Path) -> None:
+    directory = bag(pose_hz=1.0).write(tmp_path / "drive")
+    for options in (["--imu", "/pose"], ["--positions", "/imu/data"]):
+        with pytest.raises(
+            SystemExit, match=f"{options[1]} is a topic of type .*{options[0]} needs"
+        ):
+            converted(directory, *options)
+    words = [str(directory), "unused", "--wheels", "/pose", "--left", "a", "--right", "b"]
+    with pytest.raises(SystemExit, match="type PoseStamped, but --wheels needs JointState"):
+        bags.script["convert"](bags.script["parser"].parse_args(words))
+
+
+def test_two_imus_with_one_frame_on_one_topic_are_named(tmp_path: Path) -> None:
+    rng = np.random.default_rng(3)
+
+    def gyro(made: Bag, t: float, rate: float) -> None:
+        made.imu(START + t + 0.002, START + t, rate)
+        made.imu(START + t + 0.005, START + t + 0.003, float(rng.normal(0, 0.004)))
+
+    with pytest.raises(LogError, match="in yaw_rate, two series of values alternate"):
+        found(converted(bag(gyro=gyro).write(tmp_path / "drive"), *GYRO), BY_GYRO)

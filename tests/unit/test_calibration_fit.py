@@ -12,7 +12,8 @@ import numpy as np
 import pytest
 from msgspec import structs
 
-from acsard.calibration.fit import BIAS, GYRO_DELAY, fit
+from acsard.calibration.fit import AHEAD, ASIDE, BIAS, GYRO_DELAY, POSE_DELAY, Piece, fit
+from acsard.calibration.geometry import LEFT, RIGHT, TRACK, Base
 from acsard.calibration.log import LogError, TapeReading
 from acsard.core.config.settings import Config
 from tests.unit.calibration_logs import WAYS, fitted, ideal, multipliers, run, usual
@@ -204,3 +205,29 @@ def test_a_gyro_that_is_late_biased_and_interrupted_gives_the_same_track() -> No
 def test_a_log_without_a_sensor_beside_the_wheels_is_refused() -> None:
     with pytest.raises(LogError, match="no gyro and no positions"):
         fitted(usual(), gyro=False, places=False)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(3))
+def test_one_drive_of_55_s_by_positions_is_nearly_as_good_as_the_best_fit(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    robot = Robot(
+        chi=1.15, rate=0.02, left=1.056, right=1.049, place_noise=0.003, place_hz=20.0,
+        outliers=0.0, rng=rng,
+    )  # fmt: skip
+    trip = drive(robot, wander(rng, 55.0))
+    found, whole = fitted(trip, gyro=False), Piece(run(trip, gyro=False), Base.of(Config().drive))
+    free = [LEFT, RIGHT, TRACK, POSE_DELAY, AHEAD, ASIDE]
+
+    def off(p: Floats) -> Floats:
+        e = whole.residuals(p)["positions"]
+        return np.where(np.isfinite(e), e, 0.0)
+
+    best = found.p.copy()
+    for _ in range(8):
+        steps = 1e-5 * np.eye(len(best))[free]
+        columns = np.array([(off(best + step) - off(best)) * 1e5 for step in steps])
+        best[free] -= np.clip(np.linalg.lstsq(columns.T, off(best), rcond=None)[0], -0.05, 0.05)
+    rms = [float(np.sqrt(np.mean(off(p) ** 2))) for p in (found.p, best)]
+    print(f"{1000 * rms[0]:.1f} mm found, {1000 * rms[1]:.1f} mm best")
+    assert rms[0] < 1.5 * rms[1]

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from msgspec.structs import replace
 
-from acsard.calibration.fit import Base
+from acsard.calibration.geometry import Base
 from acsard.calibration.guide import MAX_REPEATS, Options, drive, guided, require_own
 from acsard.calibration.leg import require_path
 from acsard.calibration.log import Floats, Log, LogError, Notes, Run, run_of

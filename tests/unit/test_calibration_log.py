@@ -84,7 +84,7 @@ def test_single_wrong_cells_are_left_out_with_a_note() -> None:
     rows[50] = "2.5,5000,2,0.05"
     log = read(text(rows))
     assert len(log.runs[0].t) == 199
-    assert log.notes == ("cells of left left out, far above others, such as 5000: 1",)
+    assert log.notes == ("cells of left left out, far from those beside them, such as 5000: 1",)
 
 
 def test_a_dead_wheel_is_refused_and_named() -> None:

@@ -16,7 +16,8 @@ import numpy as np
 import pytest
 from msgspec import Struct, structs
 
-from acsard.calibration.fit import LEFT, RIGHT, TRACK, fit
+from acsard.calibration.fit import fit
+from acsard.calibration.geometry import LEFT, RIGHT, TRACK
 from acsard.calibration.log import Log, Run
 from acsard.calibration.noise import noise
 from acsard.calibration.result import calibrate

@@ -1,0 +1,575 @@
+"""Compares each sensor alone with the wheels, and names the mistake that explains a contradiction.
+
+A fit that is better than a wrong configuration is not right. So each sensor of every log is
+compared with the wheels as they are, with the sign of one side turned, and with the turns to the
+other side, on one grid of tracks and delays. The grid also shows the size of the wheels, so wrong
+units and counts show as a robot that cannot be. A cause is named if it leads to a possible robot.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from itertools import product
+
+import numpy as np
+import numpy.typing as npt
+from msgspec import Struct
+from msgspec.structs import replace
+
+from acsard.calibration.geometry import Base, path
+from acsard.calibration.log import Complexes, Floats, LogError, Mask, Run
+from acsard.core.config.settings import DriveConfig
+from acsard.core.values import Seconds
+
+STEP_S, WINDOW_S, GRID_S = 1.0, 10.0, 0.05  # of turns, of positions, and of the wheels' path
+MAX_SPOTS, SEARCH_S = 2000, 200.0  # positions that are compared, and parts that are searched
+APART_S = 60.0  # between two runs on their common axis of time
+MIN_ROLL, MIN_TURN, MIN_STEPS = 0.02, 0.05, 3  # rad, in a step that shows something
+HUBER = 1.5  # robust standard deviations, beyond which a position counts less
+BIAS_STD, REST_BIAS_STD, MIN_RESTS = 0.05, 1e-3, 20  # rad/s, of a gyro without and with rests
+CAP = 0.5  # rad, beyond which a turn counts as not explained
+HOLE_S, HOLE_PERIODS = 0.5, 8.0  # a hole in the samples of a sensor is longer than both
+LEVER = 1e-3  # weight of the lever of a sensor, which is small
+
+TRACKS = np.geomspace(0.3, 4.0, 66)  # of the configured one
+WIDE_TRACKS = np.geomspace(0.01, 1000.0, 200)
+FINE, QUANTILES = np.linspace(0.95, 1.05, 21), np.linspace(0.02, 0.98, 49)
+DELAYS_S, WIDE_DELAYS_S = np.linspace(-1.0, 1.0, 21), np.linspace(-8.0, 8.0, 65)
+DELAY_COST = 1e-3  # for each second: of equal delays, the least one counts
+LATE_S, NOTED_LATE_S = 0.9, 0.1
+
+FOLLOWS = 0.3  # share of a sensor's motion that the wheels need not explain
+POOR, POORER = 0.15, 3.0  # share, and in that of the best sensor, of one that is left out
+ALIAS = 0.02  # share, by which a possible robot may explain less than an impossible one
+CLEARER, CLEAR = 0.5, 0.01  # of the unexplained share: factor and margin of a better row
+TOO_GOOD = 2e-3
+LEAST_TRACK = 1e-3
+ROBOTS, USUAL_ROBOTS = (0.8, 3.6), (0.8, 2.8)  # effective track / wheel separation
+SIZES, SAME_SIZE = (0.8, 1.25), (0.8, 1.25)  # distance by positions / by the wheels
+
+BAD, BAD_TURN, BAD_WAY_M, MAX_BAD = 0.9, 0.15, 0.3, 0.4  # of a window that is left out
+MARGIN_S = 5.0  # beside a window that is left out
+LEAST_S, LEAST_PART_S = 30.0, 2.0  # of a log of which a part is left out, and of its parts
+STILL, ALONE = 1e-3, 0.2  # of a side that stands, rad in a step, and what the other rolls meanwhile
+UNSIGNED = 0.2  # share that speeds without their signs need not explain
+TWICE, BACKWARDS = 0.02, 1e-3  # shares of the rolled angle
+
+NAMES = {"gyro": "yaw_rate", "headings": "yaw", "positions": "x, y"}
+COLUMNS = {
+    "gyro": ("gyro_t", "turned"), "headings": ("yaw_t", "yaw"), "positions": ("place_t", "place"),
+}  # fmt: skip
+UNITS = "the speeds of the wheels are in {}, not in rad/s"
+COUNTS = "the speeds of the wheels are {} the true ones: correct the counts of a wheel turn"
+SPEEDS = {
+    180 / math.pi: UNITS.format("deg/s"), 60 / math.tau: UNITS.format("rpm"),
+    1 / math.tau: UNITS.format("turns/s"), 4.0: COUNTS.format("4 times"),
+    2.0: COUNTS.format("twice") + ", or drive.wheel_radius, if that is the diameter",
+    0.5: COUNTS.format("half of"), 0.25: COUNTS.format("a quarter of"),
+}  # fmt: skip
+PLACES = {
+    100.0: "x, y are in cm, not in m", 1000.0: "x, y are in mm, not in m",
+    1 / 0.3048: "x, y are in ft, not in m", 1 / 0.0254: "x, y are in inches, not in m",
+}  # fmt: skip
+SWAPPED = "left and right are swapped, or both have the wrong sign"
+MIRRORED = {
+    "gyro": "yaw_rate must grow to the left", "headings": "yaw must grow to the left",
+    "positions": "x, y are mirrored: y must point to the left of x",
+}  # fmt: skip
+
+SIDES: dict[str, Callable[[Run], tuple[Floats, Floats]]] = {
+    "given": lambda run: (run.left, run.right),
+    "one sign": lambda run: (-run.left, run.right),
+    # If the columns are angles, the angle is what was integrated.
+    "angles": lambda run: (np.gradient(run.left, run.t), np.gradient(run.right, run.t)),
+}
+
+Span = tuple[int, Seconds, Seconds]  # a part of a log: index of the run, begin and end
+
+
+class Match(Struct, frozen=True):
+    """What a sensor shows of the wheels, if one row of the table is right."""
+
+    sensor: str
+    sides: str  # a key of SIDES
+    unexplained: float  # share of the sensor's motion, without the bad windows
+    track: float  # turn by the wheels / by the sensor, as configured; negative to the other side
+    delay: Seconds
+    size: float = 1.0  # distance by positions / by the wheels, as configured
+    lever: tuple[float, float] = (0.0, 0.0)  # of the sensor, ahead and to the left, m
+    bad: tuple[Span, ...] = ()
+    as_given: float = 0.0  # share that the given row does not explain
+
+    @property
+    def follows(self) -> bool:
+        return self.unexplained < FOLLOWS
+
+    @property
+    def given(self) -> bool:
+        return self.sides == "given" and self.track > 0
+
+    @property
+    def robot(self) -> bool:
+        return ROBOTS[0] < abs(self.track) < ROBOTS[1]
+
+
+def examined(
+    runs: Sequence[Run], drive: DriveConfig
+) -> tuple[list[Run], dict[str, Match], list[str]]:
+    """Return the runs without the parts and sensors that contradict all others, the match of each
+    sensor that is left, and notes. Raise `LogError` with the cause that explains a contradiction.
+    """
+    base = Base.of(drive)
+    matches = {sensor: matched(sensor, runs, base) for sensor in sensors(runs)}
+    if any(not (m.given and m.follows) or m.bad for m in matches.values()):
+        for cause in _facts(runs, matches, base):
+            raise LogError(cause)
+    best = min((match.unexplained for match in matches.values()), default=0.0)
+    following = {
+        sensor: match for sensor, match in matches.items()
+        if match.follows
+        and (sensor != "positions" or match.unexplained < max(POOR, POORER * best))
+    }  # fmt: skip
+    if causes := [*_turned(following), *_sized(following, drive), *_late(following)]:
+        raise LogError(". ".join(causes))
+    notes = []
+    for sensor, match in matches.items():
+        name = NAMES[sensor]
+        fact = f"{match.unexplained:.0%} of the motion by {name} is not that of the wheels"
+        if not following:
+            raise LogError(
+                f"{fact}, and neither swapped sides nor signs, units or delays of up to "
+                f"{WIDE_DELAYS_S[-1]:.0f} s explain it. Is {name} of the same drive, with times "
+                "from the same clock? Did the wheels roll on the floor? Does yaw_rate turn about "
+                "the axis that points up, and do x and y lie in the floor?"
+            )
+        if sensor not in following:
+            others = " and ".join(NAMES[other] for other in following)
+            notes.append(f"{name} is left out: {fact}, but {others} follows them")
+            runs = [without(run, sensor) for run in runs]
+        elif match.unexplained < TOO_GOOD:
+            notes.append(
+                f"{name} agrees with the wheels better than a sensor can: was it computed from "
+                "them? (The true pose of the simulator agrees, too.)"
+            )
+        if sensor in following and abs(match.delay) > NOTED_LATE_S:
+            notes.append(f"the times of {name} are {1000 * match.delay:.0f} ms after the wheels'")
+    kept, more = _without_spans(runs, [span for m in following.values() for span in m.bad])
+    return kept, following, [*notes, *more]
+
+
+def sensors(runs: Sequence[Run]) -> list[str]:
+    return [s for s, (t, _) in COLUMNS.items() if any(len(getattr(run, t)) > 2 for run in runs)]
+
+
+def without(run: Run, *left_out: str) -> Run:
+    """Return the run without these sensors."""
+    empty = {name: getattr(run, name)[:0] for sensor in left_out for name in COLUMNS[sensor]}
+    return replace(run, **empty)
+
+
+def gyro_bias(runs: Sequence[Run]) -> tuple[float, float]:
+    """Return the rate that the gyro shows while the wheels rest, and its deviation, rad/s."""
+    rates = [np.zeros(0)]
+    for run in runs:
+        if len(run.gyro_t) > 1:
+            t = (run.gyro_t[1:] + run.gyro_t[:-1]) / 2
+            rates.append((np.diff(run.turned) / np.diff(run.gyro_t))[run.rests(t)])
+    rest = np.sort(np.concatenate(rates))
+    if len(rest) <= MIN_RESTS:
+        return 0.0, BIAS_STD
+    # Most of the rates may be of a robot that somebody carries: the densest ones are at rest.
+    count = len(rest) // 5
+    first = int(np.argmin(rest[count:] - rest[: len(rest) - count]))
+    middle = float(np.median(rest[first : first + count]))
+    width = rest[first + count] - rest[first]
+    return float(np.median(rest[np.abs(rest - middle) <= 6 * width])), REST_BIAS_STD
+
+
+def _without_spans(runs: Sequence[Run], spans: Sequence[Span]) -> tuple[list[Run], list[str]]:
+    made, parts = list[Run](), list[str]()
+    for n, run in enumerate(runs):
+        own = sorted((max(run.t[0], begin - MARGIN_S), min(run.t[-1], end + MARGIN_S))
+                     for index, begin, end in spans if index == n)  # fmt: skip
+        if not own:
+            made.append(run)
+            continue
+        at, first = run.t[0], len(made)
+        for begin, end in (*own, (run.t[-1], run.t[-1])):
+            if begin - at > LEAST_PART_S:
+                made.append(run.part(at, begin))
+            if end > begin:
+                parts.append(f"{begin:.0f} to {end:.0f} s of run {run.name}")
+            at = max(at, end)
+        made[first + 1 :] = [
+            replace(part, name=f"{part.name}.{k}") for k, part in enumerate(made[first + 1 :], 2)
+        ]
+    words = f"the sensors contradict the wheels there: {', '.join(parts)}"
+    left = sum(run.seconds for run in made)
+    if parts and left < LEAST_S:
+        raise LogError(f"only {left:.0f} s of the log are left, because {words}")
+    return made, [f"left out, because {words}"] if parts else []
+
+
+def matched(sensor: str, runs: Sequence[Run], base: Base) -> Match:
+    """Return the row of the table that fits a sensor: the given one, unless another is clearer."""
+    seen = Places(sensor, runs, base) if sensor == "positions" else Turns(sensor, runs, base)
+    given = seen.match("given", 1)
+    found = [seen.match(*row) for row in (("given", -1), ("one sign", 1), ("one sign", -1))]
+    best = min(found, key=lambda match: match.unexplained)
+    if best.unexplained > CLEARER * given.unexplained - CLEAR:
+        possible = [match for match in (given, *found) if match.robot]
+        # Turns of 90 deg on the spot look like turns of 270 deg to the other side.
+        if given.follows and not given.robot and possible:
+            best = min(possible, key=lambda match: match.unexplained)
+            if best.unexplained < given.unexplained + ALIAS:
+                return replace(best, as_given=given.unexplained)
+        if given.follows and abs(given.delay) < LATE_S:
+            return given
+        rows = product(("given", "angles"), (1, -1))
+        found = [seen.match(*row, wide=True) for row in rows]
+        if sensor == "headings":
+            turned = Turns(sensor, [replace(run, yaw=np.radians(run.yaw)) for run in runs], base)
+            found += [replace(turned.match("given", side), sides="degrees") for side in (1, -1)]
+        best = min(found, key=lambda match: match.unexplained)
+    clear = best.follows and best.unexplained < CLEARER * given.unexplained - CLEAR
+    return replace(best, as_given=given.unexplained) if clear else given
+
+
+def _facts(runs: Sequence[Run], matches: Mapping[str, Match], base: Base) -> Iterator[str]:
+    # Causes that the columns of the wheels show, if a sensor contradicts them.
+    names = " and ".join(NAMES[sensor] for sensor, m in matches.items() if not m.given)
+    left, right = (
+        np.concatenate([np.diff(getattr(run, side)) for run in runs]) for side in ("left", "right")
+    )
+    rolled = float(np.abs(left).sum() + np.abs(right).sum())
+    same = np.abs(left - right).sum() < TWICE * rolled
+    back = -float(np.minimum(left, 0.0).sum() + np.minimum(right, 0.0).sum())
+    for sensor in matches:
+        seen = Places(sensor, runs, base) if sensor == "positions" else Turns(sensor, runs, base)
+        if back < BACKWARDS * rolled and seen.unsigned() < UNSIGNED:
+            yield (
+                "the wheels never turn backwards in this log, and only with signs that it does not "
+                f"have they explain {NAMES[sensor]}: encoders with one channel, or a sign that was "
+                "lost. Record speeds with their sign" + (", and not one side twice" if same else "")
+            )
+    if same:
+        yield (
+            "left and right are the same in every row, although the robot turns: the log has one "
+            "side twice. Record the wheels of both sides"
+        )
+    for side, other in (("left", "right"), ("right", "left")):
+        rolled = sum(float(np.abs(np.diff(getattr(run, other))).sum()) for run in runs)
+        alone, begin, end = max(_alone(run, side, other) for run in runs)
+        if alone > ALONE * rolled:
+            yield (
+                f"{side} stands still from {begin:.0f} to {end:.0f} s, while {other} rolls "
+                f"{alone:.0f} of its {rolled:.0f} rad, and {names} contradicts that: is its "
+                "encoder dead, or its cable loose?"
+            )
+
+
+def _alone(run: Run, side: str, other: str) -> tuple[float, Seconds, Seconds]:
+    # The longest way that one side rolls while the other one stands, rad, and its begin and end.
+    edges = run.edges(STEP_S)
+    stands, rolls = (np.abs(np.diff(np.interp(edges, run.t, getattr(run, name))))
+                     for name in (side, other))  # fmt: skip
+    change = np.diff(np.concatenate(([0], (stands < STILL).astype(int), [0])))
+    ends = zip(np.flatnonzero(change > 0), np.flatnonzero(change < 0), strict=True)
+    ways = [(float(rolls[a:b].sum()), float(edges[a]), float(edges[b])) for a, b in ends]
+    return max(ways, default=(0.0, 0.0, 0.0))
+
+
+def _turned(matches: Mapping[str, Match]) -> Iterator[str]:
+    odd = {sensor: match for sensor, match in matches.items() if not match.given}
+    if not odd:
+        return
+    names = " and ".join(NAMES[sensor] for sensor in odd)
+    worst = max(odd.values(), key=lambda match: match.as_given)
+    fact = (
+        f"the wheels miss {worst.as_given:.0%} of the motion by {names}, but only "
+        f"{worst.unexplained:.0%} if"
+    )
+    kinds = {match.sides for match in odd.values()}
+    if "angles" in kinds:
+        yield (
+            f"{fact} left and right are angles or running counts: write speeds, which are 2 pi x "
+            "(counts since the last row) / (counts of a wheel turn x seconds since the last row)"
+        )
+    elif "degrees" in kinds:
+        yield f"{fact} yaw is in deg: write it in rad"
+    elif "one sign" in kinds:
+        yield f"{fact} one side has the wrong sign: turn the sign of left or of right"
+    elif len(odd) < len(matches):
+        straight = " and ".join(NAMES[sensor] for sensor in matches if sensor not in odd)
+        causes = " and ".join(MIRRORED[sensor] for sensor in odd)
+        yield f"{fact} it turns to the other side, and they follow {straight}: {causes}"
+    else:
+        sources = {"gyro" if sensor == "gyro" else "poses" for sensor in odd}
+        more = [MIRRORED[sensor] for sensor in odd if len(sources) == 1]
+        yield f"{fact} they turn to the other side: {', or '.join((SWAPPED, *more))}"
+
+
+def _sized(matches: Mapping[str, Match], drive: DriveConfig) -> Iterator[str]:
+    # Tracks and sizes that no robot has, and what would make them possible.
+    seen = [
+        (s, abs(m.track) * drive.wheel_separation_multiplier, m.size)
+        for s, m in matches.items() if m.sides != "angles"
+    ]  # fmt: skip
+
+    def possible(
+        tracks: tuple[float, float], sizes: tuple[float, float], *, speeds: float = 1.0,
+        places: float = 1.0, turns: Mapping[str, float] = {}, alias: bool = False,
+    ) -> bool:  # fmt: skip
+        return all(
+            (alias and sensor == "positions")
+            or tracks[0] < track / speeds * turns.get(sensor, 1.0) < tracks[1]
+            for sensor, track, _ in seen
+        ) and all(
+            sensor != "positions" or sizes[0] < size * speeds / places < sizes[1]
+            for sensor, _, size in seen
+        )
+
+    if possible(ROBOTS, SIZES):
+        return
+    facts = [f"by the wheels the robot turns {track:.3g} times as far as by {NAMES[sensor]}"
+             for sensor, track, _ in seen if not ROBOTS[0] < track < ROBOTS[1]]  # fmt: skip
+    facts += [f"by x, y the robot drives {size:.3g} times as far as by its wheels"
+              for _, _, size in seen if not SIZES[0] < size < SIZES[1]]  # fmt: skip
+    speeds = SPEEDS | {
+        drive.wheel_radius * factor: UNITS.format(f"{unit} at the rim")
+        for factor, unit in ((1.0, "m/s"), (1000.0, "mm/s"))
+    }
+    check = USUAL_ROBOTS, SAME_SIZE
+    causes = [words for k, words in speeds.items() if possible(*check, speeds=k)]
+    causes += [words for k, words in PLACES.items() if possible(*check, places=k)]
+    causes += [f"{NAMES[sensor]} is in deg, not in rad" for sensor, _, _ in seen
+               if possible(*check, turns={sensor: 180 / math.pi})]  # fmt: skip
+    # Turns of 90 deg on the spot show no track by positions, but their size is right.
+    causes = causes or [
+        words for k, words in speeds.items() if possible(*check, speeds=k, alias=True)
+    ]
+    yield f"{' and '.join(facts)}: " + (
+        ", or ".join(causes)
+        or "is t in s, are the speeds of the wheels and yaw_rate in rad/s, x "
+        "and y in m, and drive.wheel_radius and drive.wheel_separation right?"
+    )
+
+
+def _late(matches: Mapping[str, Match]) -> Iterator[str]:
+    for sensor, match in matches.items():
+        if abs(match.delay) > LATE_S:
+            yield (
+                f"the times of {NAMES[sensor]} are {match.delay:.1f} s after those of the wheels: "
+                "record all sensors with times from the same clock"
+            )
+
+
+class Comparison:
+    """One sensor beside the wheels: all runs on one axis of time, in steps and in windows."""
+
+    def __init__(self, sensor: str, runs: Sequence[Run], base: Base) -> None:
+        self.sensor, self.base = sensor, base
+        self.shift = np.cumsum([0.0, *(run.t[-1] + APART_S for run in runs[:-1])])
+        made: dict[str, Floats | Complexes] = {
+            name: np.concatenate(
+                [getattr(run, name) + at for run, at in zip(runs, self.shift, strict=True)]
+            )
+            for name in ("t", "gyro_t", "place_t", "yaw_t")
+        }
+        for name in ("left", "right", "turned"):
+            parts, last = [np.zeros(0)], 0.0
+            for values in [getattr(run, name) for run in runs if len(getattr(run, name))]:
+                parts.append(values - values[0] + last)
+                last = float(parts[-1][-1])
+            made[name] = np.concatenate(parts)
+        made |= {n: np.concatenate([getattr(r, n) for r in runs]) for n in ("place", "yaw")}
+        self.run = replace(runs[0], **made)
+        self.begin, self.end = self._edges(runs, STEP_S)
+        self.windows = self._edges(runs, WINDOW_S)
+
+    def _edges(self, runs: Sequence[Run], step: Seconds) -> tuple[Floats, Floats]:
+        edges = [run.edges(step) + shift for run, shift in zip(runs, self.shift, strict=True)]
+        return np.concatenate([e[:-1] for e in edges]), np.concatenate([e[1:] for e in edges])
+
+    def window(self, t: Floats) -> npt.NDArray[np.int64]:
+        return np.asarray(np.maximum(np.searchsorted(self.windows[0], t + 1e-6) - 1, 0))
+
+    def rolled(self, sides: str, begin: Floats, end: Floats) -> list[Floats]:
+        """Return the distances that the left and the right wheels roll, m."""
+        return [
+            radius * (np.interp(end, self.run.t, side) - np.interp(begin, self.run.t, side))
+            for radius, side in zip(
+                (self.base.left, self.base.right), SIDES[sides](self.run), strict=True
+            )
+        ]
+
+    def rolls(self, begin: Floats, end: Floats) -> Mask:
+        rolled = np.abs(self.rolled("given", begin, end)).sum(axis=0)
+        return np.asarray(rolled > MIN_ROLL * self.base.left)
+
+    def judged(
+        self, t: Floats, off: Floats, moved: Floats, rolls: Mask, least: float
+    ) -> tuple[float, tuple[Span, ...]]:
+        """Return the unexplained share of the motion without the bad windows, and these."""
+        window, known = self.window(t), np.isfinite(off + moved)
+
+        def sums(values: Floats, mask: Mask) -> Floats:
+            counted = np.bincount(window[mask], values[mask], minlength=len(self.windows[0]))
+            return np.asarray(counted, dtype=np.float64)
+
+        bad = sums(off - least, known) > 0
+        bad &= sums(off - BAD * moved, known) > 0
+        off, moved = (sums(values, known & rolls) for values in (off, moved))
+        if moved[bad].sum() > MAX_BAD * moved.sum():
+            bad[:] = False
+        share = np.clip(off, 0.0, moved)[~bad].sum() / max(1e-9, float(moved[~bad].sum()))
+        run = np.searchsorted(self.shift, self.windows[0], side="right") - 1
+        begin, end = (edge - self.shift[run] for edge in self.windows)
+        spans = zip(run[bad].tolist(), begin[bad].tolist(), end[bad].tolist(), strict=True)
+        return float(share), tuple(spans)
+
+
+class Turns(Comparison):
+    """The turns by a gyro or by headings, in steps."""
+
+    def __init__(self, sensor: str, runs: Sequence[Run], base: Base) -> None:
+        super().__init__(sensor, runs, base)
+        self.t, self.values = self.run.yaw_t, np.unwrap(self.run.yaw)
+        if sensor == "gyro":
+            self.t = self.run.gyro_t
+            self.values = self.run.turned - gyro_bias(runs)[0] * self.t
+        steps = np.diff(self.t)
+        holes = steps > max(HOLE_S, HOLE_PERIODS * float(np.median(steps)))
+        self.holes = np.concatenate(([0], np.cumsum(holes)))
+        self.moving = self.rolls(self.begin, self.end)
+
+    def seen(self, delay: Seconds) -> Floats:
+        begin, end = self.begin + delay, self.end + delay
+        first = np.searchsorted(self.t, begin, side="right") - 1
+        last = np.searchsorted(self.t, end)
+        inside = (first >= 0) & (last < len(self.t))
+        first, last = np.maximum(first, 0), np.minimum(last, len(self.t) - 1)
+        turned = np.interp(end, self.t, self.values) - np.interp(begin, self.t, self.values)
+        return np.where(inside & (self.holes[first] == self.holes[last]), turned, np.nan)
+
+    def match(self, sides: str, side: int, *, wide: bool = False) -> Match:
+        left, right = self.rolled(sides, self.begin, self.end)
+        wheels = (right - left) / self.base.track * side
+        best, moved = (math.inf, 1.0, 0.0), np.abs(self.seen(0.0))
+        whole = float(np.nansum(np.minimum(moved, CAP)[self.moving])) + 1e-9
+        for delay in WIDE_DELAYS_S if wide else DELAYS_S:
+            seen = self.seen(delay)
+            used = self.moving & np.isfinite(seen)
+            y, x = seen[used], wheels[used]
+            ratios = x[np.abs(y) > MIN_TURN] / y[np.abs(y) > MIN_TURN]
+            tracks = np.concatenate((np.quantile(ratios, QUANTILES) if len(ratios) else [], TRACKS))
+            tracks = tracks[tracks > LEAST_TRACK]
+            for _ in range(2):
+                off = np.minimum(np.abs(y - x / tracks[:, None]), CAP).sum(axis=1)
+                # A step that the delay loses is not explained.
+                cost = 1 + (off - np.minimum(np.abs(y), CAP).sum()) / whole
+                cost += DELAY_COST * abs(delay)
+                at = int(np.argmin(cost))
+                best = min(best, (float(cost[at]), float(tracks[at]), float(delay)))
+                tracks = tracks[at] * FINE
+        _, track, delay = best
+        off = np.abs(self.seen(delay) - np.where(self.moving, wheels, 0.0) / track)
+        off = np.where(np.isnan(off), np.minimum(moved, BAD_TURN), off)
+        share, bad = self.judged(self.begin, off, moved, self.moving, BAD_TURN)
+        return Match(self.sensor, sides, share, side * track, delay, bad=bad)
+
+    def unsigned(self) -> float:
+        """Return the share of the turns that the wheels do not explain with any signs."""
+        a, b = self.rolled("given", self.begin, self.end)
+        seen = self.seen(0.0)
+        used = self.moving & np.isfinite(seen)
+        options = np.array([a + b, a - b, b - a, -a - b])[:, used] / self.base.track
+        off = np.abs(seen[used] - options[:, None] / TRACKS[:, None]).min(axis=0).sum(axis=1)
+        return float(off.min() / np.abs(seen[used]).sum())
+
+
+class Places(Comparison):
+    """Positions, in windows of which each is turned and moved onto the path of the wheels."""
+
+    def __init__(self, sensor: str, runs: Sequence[Run], base: Base) -> None:
+        super().__init__(sensor, runs, base)
+        every = max(1, len(self.run.place_t) // MAX_SPOTS)
+        self.t, self.place = self.run.place_t[::every], self.run.place[::every]
+        window = self.window(self.t)
+        self.first = np.flatnonzero(np.diff(window, prepend=-1))
+        self.part = np.cumsum(np.diff(window, prepend=-1) != 0) - 1
+        edges = [run.edges(GRID_S) + shift for run, shift in zip(runs, self.shift, strict=True)]
+        self.grid = np.concatenate(edges)
+        between = self.run.place[1:-1] - (self.run.place[2:] + self.run.place[:-2]) / 2
+        self.noise = float(np.median(np.abs(between))) / math.sqrt(1.5)
+        self.rolling = {s: self.rolled(s, self.grid[:-1], self.grid[1:]) for s in SIDES}
+        # A part of a long log suffices for the search.
+        every = int(sum(run.seconds for run in runs) / SEARCH_S)
+        parts = [run.part(a, a + WINDOW_S) for run in runs
+                 for a in np.arange(run.t[0], run.t[-1] - STEP_S, WINDOW_S)]  # fmt: skip
+        self.few = Places(sensor, parts[::every], base) if 1 < every < len(parts) / 3 else self
+
+    def fitted(self, sides: str, track: float, delay: Seconds) -> tuple[float, Floats, Floats]:
+        """Return the unexplained share, size of the wheels and lever, and each error, m."""
+        a, b = self.rolling[sides]
+        place, heading = path((a + b) / 2, (b - a) / (self.base.track * track))
+        at = self.t - delay
+        model = np.interp(at, self.grid, place.real) + 1j * np.interp(at, self.grid, place.imag)
+        lever = np.exp(1j * np.interp(at, self.grid, heading))
+        weight, turned = np.ones(len(at)), model
+        for _ in range(3):
+            seen, m, e, turned = (
+                v - (np.add.reduceat(weight * v, self.first)
+                     / np.add.reduceat(weight, self.first))[self.part]
+                for v in (self.place, model, lever, turned)
+            )  # fmt: skip
+            turn = np.add.reduceat(weight * seen * turned.conj(), self.first)
+            turn = np.where(np.abs(turn) > 1e-9, turn, 1.0)  # of wheels that stand
+            back = seen * (turn / np.abs(turn)).conj()[self.part]
+            columns = np.array([m, e, 1j * e])
+            # The threads of a matrix product cost more than they save here.
+            normal = np.einsum("in,n,jn->ij", columns.conj(), weight, columns).real
+            normal += np.diag([1e-9, LEVER * len(at), LEVER * len(at)])
+            score = np.einsum("in,n,n->i", columns.conj(), weight, back).real
+            x = np.linalg.solve(normal, score)
+            turned = x[0] * m + (x[1] + 1j * x[2]) * e
+            off = np.abs(back - turned)
+            weight = np.minimum(1.0, (HUBER * np.median(off) + 1e-9) / (off + 1e-12))
+        wrong, moved = (np.add.reduceat(v, self.first) for v in (off, np.abs(seen)))
+        return float(np.minimum(wrong, moved).sum() / max(1e-9, moved.sum())), x, off
+
+    def match(self, sides: str, side: int, *, wide: bool = False) -> Match:
+        few = self.few
+
+        def best(tracks: Floats, delays: Floats) -> tuple[float, float, float]:
+            return min(
+                (few.fitted(sides, track, delay)[0] + DELAY_COST * abs(delay), track, delay)
+                for track in tracks.tolist() for delay in delays.tolist()
+            )  # fmt: skip
+
+        tracks = WIDE_TRACKS if wide else TRACKS
+        _, track, delay = best(side * tracks, np.zeros(1))
+        if wide and sides == "given":
+            late = best(side * TRACKS[::3], WIDE_DELAYS_S)
+            track, delay = min((few.fitted(sides, track, delay)[0], track, delay), late)[1:]
+        _, _, delay = best(np.array([track]), delay + DELAYS_S)
+        _, track, _ = best(np.append(side * TRACKS, track * FINE), np.array([delay]))
+        raw, (size, ahead, aside), off = self.fitted(sides, track, delay)
+        moved = np.abs(self.place - (np.add.reduceat(self.place, self.first)
+                                     / np.bincount(self.part))[self.part])  # fmt: skip
+        rolls = self.rolls(self.t - STEP_S / 2, self.t + STEP_S / 2)
+        share, bad = self.judged(self.t, off - self.noise, moved, rolls, BAD_WAY_M)
+        share = max(share, min(raw, TOO_GOOD))  # the noise does not hide that it is too good
+        if not tracks[0] < abs(track) < tracks[-1]:
+            share = max(share, FOLLOWS)  # the best track is none of a robot
+        lever = float(ahead), float(aside)
+        return Match(self.sensor, sides, share, track, delay, float(size), lever, bad)
+
+    def unsigned(self) -> float:
+        """Return the share of the ways that the wheels do not explain with any signs."""
+        ends = [np.interp(t, self.t, self.place) for t in (self.begin, self.end)]
+        ways = np.abs(ends[1] - ends[0])
+        a, b = self.rolled("given", self.begin, self.end)
+        off = np.minimum(np.abs(ways - np.abs(a + b) / 2), np.abs(ways - np.abs(a - b) / 2))
+        return float(off.sum() / max(1e-9, ways.sum()))

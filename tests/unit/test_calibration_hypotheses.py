@@ -1,0 +1,262 @@
+"""A log whose parts contradict each other is refused with the cause, or used without them.
+
+`-n 0 -s -m soak` prints the table of the planted faults.
+"""
+
+from __future__ import annotations
+
+import re
+import time
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from acsard.calibration.log import Log, LogError, read
+from acsard.calibration.result import Result, calibrate
+from acsard.core.config.settings import Config
+from tests.unit.calibration_bags import DRIVE, END
+from tests.unit.calibration_faults import (
+    FAULTS,
+    NOT_SHOWN,
+    SENSORS,
+    Columns,
+    csv,
+    named,
+    planted,
+    sound,
+    times,
+)
+from tests.unit.calibration_logs import run, runs, usual
+from tests.unit.calibration_robots import Robot, drive
+
+BY_GYRO, BY_POSES = (1.4925, 0.9950, 1.0050), (1.500, 1.000, 1.010)
+GYRO, HEADING, PLACES = ("yaw_rate",), ("yaw",), ("x", "y")
+
+
+def result(data: bytes) -> Result:
+    return calibrate(read(data), Config(), "drive.csv")
+
+
+def refusal(data: bytes) -> str:
+    with pytest.raises(LogError) as refused:
+        result(data)
+    assert "agrees" not in str(refused.value)
+    return str(refused.value)
+
+
+def right(data: bytes, truth: tuple[float, ...], note: str) -> None:
+    found = result(data)
+    assert found.better
+    assert list(found.found.values()) == pytest.approx(truth, abs=0.01)
+    assert any(re.search(note, text) for text in found.notes) == bool(note), found.notes
+
+
+# planted faults
+
+EVERY = [(way, fault) for way in SENSORS for fault in FAULTS if fault not in NOT_SHOWN[way]]
+QUICK = ["one sign", "counts x 1/2", "one side twice", "no signs", "2 s late", "another drive"]
+
+
+@pytest.mark.parametrize("fault", QUICK)
+def test_a_planted_fault_is_named(fault: str) -> None:
+    assert named(fault, refusal(planted(fault, "gyro", 3)))
+
+
+@pytest.mark.slow
+@pytest.mark.nightly
+@pytest.mark.parametrize(("way", "fault"), EVERY)
+def test_each_planted_fault_is_named(way: str, fault: str) -> None:
+    assert named(fault, refusal(planted(fault, way, 4)))
+
+
+@pytest.mark.soak
+@pytest.mark.parametrize(("way", "fault"), EVERY)
+def test_planted_faults_are_never_written_and_named_in_80_percent(way: str, fault: str) -> None:
+    count = sum(named(fault, refusal(planted(fault, way, seed))) for seed in range(10))
+    print(f"\n| {way} | {fault} | {count} of 10 |")
+    assert count >= 8
+
+
+@pytest.mark.soak
+@pytest.mark.parametrize("way", SENSORS)
+def test_sound_logs_are_accepted(way: str) -> None:
+    truth = BY_GYRO if way == "gyro" else BY_POSES
+    for seed in range(10):
+        right(csv(sound(seed, SENSORS[way])), truth, "")
+
+
+# situations of real logs, and their siblings
+
+
+def with_time(unit: float, names: tuple[str, ...] = GYRO) -> bytes:
+    return csv(times(unit, "t")(sound(1, names)))
+
+
+def thinned(rows: Columns, every: int) -> Columns:
+    return {name: values[::every] for name, values in rows.items()}
+
+
+def alternating(names: tuple[str, ...], column: str, other: float, every: int) -> bytes:
+    """Return a log of which every some values of a column are of another sensor at rest."""
+    rows = sound(2, names)
+    rng = np.random.default_rng(2)
+    known = np.flatnonzero(np.isfinite(rows[column]))[::every]
+    rows[column][known] = other + rng.normal(0, 0.004, len(known))
+    return csv(rows)
+
+
+def carried(names: tuple[str, ...], begin: float, seconds: float = 20.0) -> bytes:
+    """Return a log during which the robot is carried, from a time on, while its wheels rest."""
+    rows = sound(5, names)
+    n = int(begin / 0.02)
+    t = np.arange(0, seconds, 0.02)
+    rng = np.random.default_rng(5)
+    rate = 0.8 * np.sin(t) + 0.5
+    more = {"left": 0 * t, "right": 0 * t, "yaw_rate": 0.01 + rate + rng.normal(0, 0.004, len(t)),
+            "x": 1.5 * np.sin(t / 3), "y": 0.2 * t}  # fmt: skip
+    made: Columns = {"t": np.linspace(0.0, 0.02, len(rows["t"]) + len(t))}
+    made["t"] *= len(made["t"]) - 1
+    for name in ("left", "right", *names):
+        if name in PLACES:  # it is put down elsewhere
+            last = rows[name][:n][np.isfinite(rows[name][:n])][-1]
+            tail = rows[name][n:] + more[name][-1]
+            made[name] = np.concatenate((rows[name][:n], last + more[name], tail))
+        else:
+            made[name] = np.concatenate((rows[name][:n], more[name], rows[name][n:]))
+    return csv(made)
+
+
+def gps(seed: int, hz: int = 1) -> bytes:
+    """Return a log with a sound gyro beside a cheap GPS receiver."""
+    rows, rng = sound(seed, ("yaw_rate", *PLACES)), np.random.default_rng(seed)
+    drift = np.zeros((2, int(END) + 3))
+    for n in range(1, drift.shape[1]):
+        drift[:, n] = drift[:, n - 1] * (1 - 1 / 60) + rng.normal(0, 1.5 * np.sqrt(2 / 60), 2)
+    t = rows["t"]
+    for k, name in enumerate(PLACES):
+        place = np.interp(t, DRIVE["t"], DRIVE[name]) + drift[k][t.astype(int)]
+        place += rng.normal(0, 0.1, len(t))
+        rows[name] = np.where(np.arange(len(t)) % (50 // hz), np.nan, place)
+    return csv(rows)
+
+
+def changed(names: tuple[str, ...], seed: int, change: Callable[[Columns], Columns]) -> bytes:
+    return csv(change(sound(seed, names)))
+
+
+def plane(rows: Columns, **places: float | str) -> Columns:
+    """Replace each position by a constant, or by the other column."""
+    rng, made = np.random.default_rng(9), dict(rows)
+    for name, value in places.items():
+        level = value + rng.normal(0, 0.004, len(rows["t"])) if isinstance(value, float) else None
+        source = rows[str(value)] if level is None else level
+        made[name] = np.where(np.isfinite(rows[name]), source, np.nan)
+    return made
+
+
+def noisy(rows: Columns, std: float, *names: str) -> Columns:
+    rng = np.random.default_rng(1)
+    return rows | {name: rows[name] + rng.normal(0.3, std, len(rows["t"])) for name in names}
+
+
+def degrees(rows: Columns) -> Columns:
+    return rows | {"yaw": np.degrees(np.angle(np.exp(1j * rows["yaw"])))}
+
+
+def angles(factor: float, names: tuple[str, ...] = GYRO) -> bytes:
+    return csv(times(factor, "left", "right")(sound(3, names, angles=True)))
+
+
+MIXED = "two series of values alternate"
+MIRRORED = "x, y are mirrored"
+ADD_UP = "left and right are angles or running counts"
+BOTH = ("yaw_rate", *PLACES)
+CAUSES: dict[str, tuple[Callable[[], bytes], str]] = {
+    "t in ms": (lambda: with_time(1000.0), "is t in s, and not in ms"),
+    "t in ms at 10 Hz": (
+        lambda: csv(thinned(times(1000.0, "t")(sound(1, GYRO)), 5)), "is t in s, and not in ms"),
+    "t in us": (lambda: with_time(1e6), "is t in s"),
+    "t in 1/100 s": (lambda: with_time(100.0, PLACES), "is t in s"),
+    "two IMUs": (lambda: alternating(GYRO, "yaw_rate", 0.0, 2), f"yaw_rate, {MIXED}"),
+    "IMUs of other rates": (lambda: alternating(GYRO, "yaw_rate", 0.0, 3), f"yaw_rate, {MIXED}"),
+    "two robots seen": (lambda: alternating(PLACES, "x", 5.0, 2), f"x, y, {MIXED}"),
+    "two drivers": (lambda: alternating(GYRO, "left", 0.0, 2), f"left, {MIXED}"),
+    "y points down": (lambda: changed((*PLACES, *HEADING), 3, times(-1.0, "y")), MIRRORED),
+    "x, y swapped": (lambda: changed(BOTH, 3, lambda r: r | {"x": r["y"], "y": r["x"]}), MIRRORED),
+    "x mirrored": (lambda: changed(BOTH, 3, times(-1.0, "x")), MIRRORED),
+    "compass": (lambda: changed((*PLACES, *HEADING), 3, times(-1.0, "yaw")), "yaw must grow"),
+    "gyro upside down": (lambda: changed(BOTH, 3, times(-1.0, "yaw_rate")), "yaw_rate must grow"),
+    "gyro in deg/s": (lambda: changed(BOTH, 3, times(57.29578, "yaw_rate")), "yaw_rate is in deg"),
+    "yaw in deg": (lambda: changed((*PLACES, *HEADING), 3, degrees), "yaw is in deg"),
+    "gyro at 3/4": (lambda: changed(BOTH, 3, times(0.75, "yaw_rate")), "contradict each other"),
+    "counts": (lambda: angles(720 / np.pi), ADD_UP),
+    "angles": (lambda: angles(1.0), ADD_UP),
+    "ways in m": (lambda: angles(0.05), ADD_UP),
+    "angles, by positions": (lambda: angles(1.0, PLACES), ADD_UP),
+    "m/s": (lambda: changed(PLACES, 3, times(0.05, "left", "right")), "in m/s at the rim"),
+    "turns/s": (lambda: changed(BOTH, 3, times(0.5 / np.pi, "left", "right")), "in turns/s"),
+    "mm": (lambda: changed(BOTH, 3, times(1000.0, *PLACES)), "in mm"),
+}  # fmt: skip
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", CAUSES)
+def test_the_cause_is_named(kind: str) -> None:
+    data, words = CAUSES[kind]
+    assert words in refusal(data())
+
+
+LEFT_OUT = "left out"
+RIGHT: dict[str, tuple[Callable[[], bytes], tuple[float, ...], str]] = {
+    "another plane": (lambda: changed((*PLACES, *HEADING), 4, lambda r: plane(r, x=0.02, y="x")),
+                      BY_GYRO, "x, y is left out"),
+    "another plane, 2": (lambda: changed((*PLACES, *HEADING), 5, lambda r: plane(r, x=0.02, y="x")),
+                         BY_GYRO, "x, y is left out"),
+    "another plane, 3": (lambda: changed(BOTH, 6, lambda r: plane(r, x="y", y=0.3)),
+                         BY_GYRO, "x, y is left out"),
+    "carried after": (lambda: carried(GYRO, END - 0.1), BY_GYRO, LEFT_OUT),
+    "carried before": (lambda: carried(GYRO, 1.0), BY_GYRO, LEFT_OUT),
+    "carried, by positions": (lambda: carried(PLACES, END - 4.0), BY_POSES, LEFT_OUT),
+    "carried, by both": (lambda: carried(BOTH, 60.0), BY_POSES, LEFT_OUT),
+    "gps": (lambda: gps(3), BY_GYRO, "x, y is left out"),
+    "gps, 2": (lambda: gps(4), BY_GYRO, "x, y is left out"),
+    "gps at 5 Hz": (lambda: gps(5, 5), BY_GYRO, "x, y is left out"),
+    "gyro about another axis": (
+        lambda: changed(BOTH, 6, lambda r: noisy(times(0.0, "yaw_rate")(r), 0.2, "yaw_rate")),
+        BY_POSES, "yaw_rate is left out"),
+    "positions +- 10 cm": (lambda: changed(BOTH, 6, lambda r: noisy(r, 0.1, *PLACES)), BY_GYRO, ""),
+}  # fmt: skip
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", RIGHT)
+def test_what_contradicts_all_others_is_left_out(kind: str) -> None:
+    data, truth, note = RIGHT[kind]
+    right(data(), truth, note)
+
+
+def test_a_sensor_that_was_computed_from_the_wheels_is_noted() -> None:
+    trip = usual()
+    rate = (trip.right - trip.left) * 0.05 / 0.45
+    log = Log((run(replace(trip, gyro_t=trip.t, gyro=rate), places=False),), ("a note",))
+    notes = calibrate(log, Config(), "a.csv").notes
+    assert any("yaw_rate agrees with the wheels better than a sensor can" in n for n in notes)
+    assert notes[-1] == "a note"
+
+
+def test_wheels_that_hardly_roll_are_refused() -> None:
+    with pytest.raises(LogError, match=r"the wheels roll only 0\.0 rad"):
+        result(csv(times(0.0, "left", "right")(sound(1, GYRO))))
+
+
+@pytest.mark.slow
+def test_145_short_runs_take_less_than_5_s() -> None:
+    rng = np.random.default_rng(5)
+    robot = Robot(chi=1.9, rate=0.1, slip=0.1, rng=rng, place_hz=20.0, outliers=0.0)
+    plan = [(2.0, *rng.uniform((0, -1.6), (0.5, 1.6))) for _ in range(145)]
+    log = Log(tuple(runs([drive(robot, [leg]) for leg in plan])), ())
+    begin = time.process_time()
+    assert calibrate(log, Config(), "a.csv").better
+    assert time.process_time() - begin < 5.0
