@@ -226,7 +226,7 @@ RIGHT: dict[str, tuple[Callable[[], bytes], tuple[float, ...], str]] = {
     "gyro about another axis": (
         lambda: changed(BOTH, 6, lambda r: noisy(times(0.0, "yaw_rate")(r), 0.2, "yaw_rate")),
         BY_POSES, "yaw_rate is left out"),
-    "positions +- 10 cm": (lambda: changed(BOTH, 6, lambda r: noisy(r, 0.1, *PLACES)), BY_GYRO, ""),
+    "places +- 10 cm": (lambda: changed(BOTH, 6, lambda r: noisy(r, 0.1, *PLACES)), BY_POSES, ""),
 }  # fmt: skip
 
 
