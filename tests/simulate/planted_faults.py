@@ -582,7 +582,7 @@ CASES = (
           'self.latches.of("fault") or causes]', "causes]"),
     fault("case 9", "healthy motors that lag latch the fault `runaway`", OBEDIENCE,
           "return min(self.astray)", "return self.astray[0]",
-          Edit("core/motion/sides.py", "self.due.add(told, half, whole)", "self.due.add(told)")),
+          Edit("core/motion/sides.py", "self.due.add(command, half, whole)", "self.due.add(command)")),
     fault("case 10", "`state` keeps the last speed when the link is gone",
           "core/summary.py", "silent = odometry.pose, session.silent(now_ns)",
           "silent = odometry.pose, False"),
