@@ -269,7 +269,8 @@ port_trouble
     {trouble}
 port_released
     the serial port is released to another program:
-    -> type `acsard call activate` to open it again
+    -> type `acsard call activate` to open it again (before it `acsard call clear`, if the robot is
+    stopped or in fault)
 booting
     the port is open; waiting for the microcontroller's first good lines
 link_up

@@ -73,8 +73,8 @@ UNLATCHED = (Mode.DRIVING, Mode.READY)  # their reason depends only on the choic
 QUIET = News()
 
 PORT_LENT = (
-    "the serial port is closed; type `acsard call activate` to open it again. The robot may have "
-    "been pushed until then, so its pose is less certain: `acsard call set_pose` says where it is"
+    "the serial port is closed; type `acsard call activate` to open it again (before it `acsard "
+    "call clear`, if the robot is stopped or in fault). The robot may have been pushed until then, so its pose is less certain: `acsard call set_pose` says where it is"
 )
 
 ALREADY_LENT = (
@@ -433,7 +433,9 @@ class Robot:
         # do not follow the commanded speeds are not a sign of a fault.
         estop = state.inputs.estop
         pressed = estop.is_pressed or estop.pressed_now is not None
-        wheels.commanded = None if pressed else state.out.speeds
+        # Without a link the board hears nothing, and must stop the motors.
+        speeds = state.out.speeds if state.session.link == "up" else STILL
+        wheels.commanded = None if pressed else speeds
         wheels.late = state.session.steps.step_s > WRITE_PAUSE_S
         estimate = state.odometry.fold(line, checks, self.model)
         if wheels.fault is not None:

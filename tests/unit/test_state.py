@@ -178,11 +178,12 @@ def test_what_the_wheels_do_is_reported_and_counted() -> None:
         (WheelSpeeds(5.0, 5.0, 5.0, 5.0), False, "uncommanded_motion", "uncommanded_motion"),
         (replace(ROLLING, front_left=0.0), True, "wheel_fault", "wheel_faults"),
         (WheelSpeeds(-10.0, -10.0, -10.0, -10.0), True, "fault", "lines"),
+        (WheelSpeeds(0.0, 0.0, 0.0, 0.0), True, "wheel_fault", "wheel_faults"),
     ):
         rig = Rig(watched=True)
         rig = rig.driving() if commanded else rig.linked()
         rig.reply = rig.codec.encode(speeds)
-        outs = rig.each(200, *[GO] * commanded)
+        outs = rig.each(400, *[GO] * commanded)
         assert event in [name for out in outs for name in names(out)]
         assert rig.counters[counter] >= 1
 
