@@ -74,7 +74,8 @@ QUIET = News()
 
 PORT_LENT = (
     "the serial port is closed; type `acsard call activate` to open it again (before it `acsard "
-    "call clear`, if the robot is stopped or in fault). The robot may have been pushed until then, so its pose is less certain: `acsard call set_pose` says where it is"
+    "call clear`, if the robot is stopped or in fault). The robot may have been pushed until then, "
+    "so its pose is less certain: `acsard call set_pose` says where it is"
 )
 
 ALREADY_LENT = (
