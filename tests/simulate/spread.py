@@ -14,6 +14,9 @@ from tests.simulate.roads import NS
 
 Estimate = tuple[int, float, float, float, tuple[float, ...], tuple[float, ...]]
 
+SIZE, RATIO, TRACKS = 0.02, 0.01, {4: 0.3, 2: 0.05}
+"""Deviations of a robot that nobody has calibrated, by the number of its wheels."""
+
 ROOM = 10.0
 """Factor allowed beside the bound. It covers terms of second order and the shape of a path."""
 
@@ -57,7 +60,7 @@ class Spread:
         # A wrong number of counts, once it is known, makes the pose doubtful.
         miscounts = mcu_counts and mcu_counts != (counts or 3200)
         self._judged = not (config.get("odometry") or coarse or miscounts) and usual
-        self._track = 2 * witness.half
+        self._track, self._track_std = 2 * witness.half, TRACKS[len(set(witness.names))]
         every_s = max(witness.period_ns / NS, config["mcu"].get("reply_period", 0.0))
         self._longest_ns = 2 * max(int(every_s * NS), LEAST_NS)
         """A longer time between two estimates is a gap, in which the covariance grows faster."""
@@ -94,11 +97,11 @@ class Spread:
         turn = abs(math.remainder(yaw - last[3], math.tau))
         # The rates are of a robot as a whole. Those of its two sides have twice the sum at most.
         rolled = 2 * way + self._track * turn / 2
-        place = self._place + way * self._yaw
+        # Errors of the size, of the ratio and of the track add up along the whole way.
+        place = self._place + way * (self._yaw + SIZE)
         self._place = math.sqrt(place**2 + self._by_metre * rolled)
-        self._yaw = math.sqrt(
-            self._yaw**2 + self._yaw_by_metre * rolled + self._yaw_by_radian * turn
-        )
+        yaw = self._yaw + RATIO * way / self._track + self._track_std * turn
+        self._yaw = math.sqrt(yaw**2 + self._yaw_by_metre * rolled + self._yaw_by_radian * turn)
         wide = self._yaw < UNKNOWN_RAD and xx + yy > ROOM * self._place**2 + COUNTS_M2
         if wide or yawyaw > ROOM * self._yaw**2 + COUNTS_RAD2:
             raise BrokenError(
