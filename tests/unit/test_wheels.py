@@ -176,6 +176,44 @@ def test_a_blocked_wheel_that_springs_back_by_a_count_rolls_on_nowhere(
 
 
 @each("wheels", MAPS)
+def test_sides_that_are_swapped_in_a_turn_about_one_of_them_are_found(wheels: WheelMap) -> None:
+    """The right side is commanded to stand, and the robot drives: no wheel of it rests."""
+    bench = Bench(wheels=wheels)
+    bench.run(0.0, 0.0, 2.0)
+    told, turned = WheelSpeeds(0.0, 8.0, 8.0, 0.0), WheelSpeeds(8.0, 0.0, 0.0, 8.0)
+    bench.run(turned, told, 2.0, until_fault=True)
+    assert bench.faults == ["wheels_swapped"]
+    assert bench.pushes == 0
+
+
+@each("wheels", MAPS)
+@each("press_s", [0.05, 0.2])
+@each("dead_s", [0.2, 0.4, 0.6])
+def test_a_short_press_of_the_emergency_stop_makes_no_runaway_of_a_dead_time(
+    dead_s: float, press_s: float, wheels: WheelMap
+) -> None:
+    """The motors keep their power, and do not see the zeros yet."""
+    bench, dead, wished = Bench(wheels=wheels).driven(), [10.0] * round(dead_s / PERIOD), 10.0
+    for step in range(300):
+        pressed = step < round(press_s / PERIOD)
+        wished = 0.0 if pressed else max(0.0, wished - 0.2)
+        dead.append(wished)
+        bench.run(dead.pop(0), None if pressed else wished)
+    assert bench.faults == []
+
+
+@each("wheels", MAPS)
+@each("counts", [16, 24, 48, 96])
+def test_a_count_that_is_crossed_to_and_fro_is_no_motion(counts: int, wheels: WheelMap) -> None:
+    bench, count = Bench(counts, wheels=wheels), count_angle(counts) / PERIOD
+    for _ in range(100):
+        for sign in (1.0, -1.0):
+            bench.run(sign * count, sign * 0.3, PERIOD)
+            bench.run(0.0, sign * 0.3, 0.19)
+    assert bench.faults == []
+
+
+@each("wheels", MAPS)
 def test_wheels_that_rested_and_are_then_turned_are_reported_and_never_a_fault(
     wheels: WheelMap,
 ) -> None:

@@ -91,8 +91,13 @@ class Obedience(Struct):
         """The same, or how far it did not roll."""
         return max(self.unexplained, min(self.slow))
 
-    def add(self, speed: RadPerS, bounds: list[Bounds], s: Seconds, limit: Rad) -> None:
-        """Add the smoothed speed of `s` seconds. `limit` is the evidence for a fault."""
+    def add(
+        self, speed: RadPerS, shown: RadPerS, bounds: list[Bounds], s: Seconds, limit: Rad
+    ) -> None:
+        """Add smoothed speeds of `s` seconds, and `limit`, the evidence for a fault.
+
+        `shown` is the magnitude with the counts that a wheel shows to and fro at their edge.
+        """
         speeds, most, keep = self.speeds, MAX_EVIDENCE * limit, 1.0 - s / LEAK_S
         speeds.insert(0, speed)
         change = REACTION * (speed - speeds.pop())
@@ -114,7 +119,7 @@ class Obedience(Struct):
             astray.append(0.0 if was < 0.0 else most if was > most else was)
             was_fast += (turns - largest) * s
             fast.append(0.0 if was_fast < 0.0 else most if was_fast > most else was_fast)
-            was_slow += (least - turns) * s
+            was_slow += (least - shown) * s
             slow.append(0.0 if was_slow < 0.0 else most if was_slow > most else was_slow)
         self.astray, self.fast, self.slow = astray, fast, slow
 

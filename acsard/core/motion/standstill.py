@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from typing import Literal
 
-from msgspec import Struct
+from msgspec import Struct, field
 
 from acsard.core.codes import Reason, joined, reason
 from acsard.core.values import Rad, RadPerS, Seconds
@@ -34,8 +34,7 @@ class Standstill(Struct):
     none_angle: Rad = 0.0  # the most that was commanded meanwhile
     fast_s: Seconds = 0.0  # of it, with commands of `TURNS` at least
     why: Reason | None = None  # until a wheel turns
-    tries: int = 0
-    tries_s: Seconds = 0.0  # since the first of them
+    tries: list[Seconds] = field(default_factory=list)  # the time since each of them
 
     def forget(self) -> None:
         self.all_turned, self.none_s, self.none_angle, self.fast_s = False, 0.0, 0.0, 0.0
@@ -46,9 +45,7 @@ class Standstill(Struct):
         """Add a block: the angles of the wheels, and the commands of the left and right side."""
         turned, command = [abs(angle) for angle in angles], max(map(abs, commands))
         if self.tries:
-            self.tries_s += s
-            if self.tries_s > TRIES_S:
-                self.tries = 0
+            self.tries = [since + s for since in self.tries if since + s <= TRIES_S]
         if any(turned):
             if min(turned) >= TURNS * s:
                 self.all_turned, self.slow_s = True, 0.0
@@ -73,14 +70,12 @@ class Standstill(Struct):
             self.all_turned, self.fast_s = False, 0.0
             return "fault"
         if self.fast_s >= BEGIN_S:
-            if not self.tries:
-                self.tries_s = 0.0
-            self.tries += 1
+            self.tries.append(0.0)
             self.fast_s = 0.0
             self.why = _why("no_wheel_begins", commands, self.none_s)
-            if self.tries < TRIES:
+            if len(self.tries) < TRIES:
                 return "given up"
-            self.tries = 0
+            self.tries = []
             return "fault"
         if self.why is None and self.none_s >= REPORT_S and self.none_angle >= REPORT_ANGLE + count:
             self.why = _why("no_wheel_begins", commands, self.none_s)

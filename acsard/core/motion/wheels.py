@@ -54,7 +54,9 @@ from acsard.core.values import (
 )
 
 BLOCK_S = 0.05
-MAX_BLOCK_S = 0.1  # the longest time for which one line is evidence: it may cover a stall
+# The longest time for which one line is evidence: the longest `mcu.reply_period`. A line may also
+# cover a stall. It is as many blocks as it has times of `BLOCK_S`, or its delays were too long.
+MAX_BLOCK_S = 0.25
 
 FAULT_ANGLE, FAULT_COUNTS = 1.0, 3.0  # rad and counts, both of them
 # Beyond these, of the largest speed: by so much may the motion be earlier or later than a delay.
@@ -91,6 +93,9 @@ class Wheel(Struct):
     speed: RadPerS = 0.0  # smoothed
     expected: RadPerS = 0.0  # smoothed alike
     turned: Rad = 0.0  # since the last step
+    sure: Rad = 0.0  # the same, but not within a count: at its edge, a wheel shows it to and fro
+    sure_speed: RadPerS = 0.0  # smoothed
+    play: Rad = 0.0  # how far the wheel may turn back within a count
     agrees: bool = True
     obedience: Obedience = field(default_factory=Obedience)
     rolled: Rad = 0.0  # either way, while it is faster or slower than expected
@@ -182,6 +187,8 @@ class Wheels(Struct):
     def forget(self) -> None:
         """Drop the evidence of faults: one was cleared."""
         self._drop()
+        for side in self.sides:
+            side.forget()
         for wheel in self.wheels:
             wheel.doubted = False
         self._begin()
@@ -235,10 +242,8 @@ class Wheels(Struct):
     def _drop(self) -> None:
         self.begins = True
         for wheel in self.wheels:
-            wheel.speed, wheel.obedience = 0.0, Obedience()
+            wheel.speed, wheel.sure_speed, wheel.obedience = 0.0, 0.0, Obedience()
             wheel.fast_s = wheel.fast_angle = wheel.missed = 0.0
-        for side in self.sides:
-            side.forget()
         self.standstill.forget()
 
     def _end_block(
@@ -252,44 +257,66 @@ class Wheels(Struct):
         block = Block(s, angles, line, speeds, count, rest)
         if commanded is None:
             self._drop()
+            self._follow_commands(STILL, s, lag)
+            self.step_s += s
+            if self.step_s >= BLOCK_S:
+                # What was due before the press is still due after it: it may be a short one.
+                for side in self.sides:
+                    side.remember(self.step_s, 1.0 / self.step_s)
+                self._begin_step()
             for wheel, angle in zip(self.wheels, angles, strict=False):
                 _rest(wheel, angle, block)
         else:
-            left, right = self.sides
-            left.expect(commanded.front_left, s, lag)
-            right.expect(commanded.front_right, s, lag)
-            if self.begins or self.late:
-                for side in self.sides:
-                    speed = max(angles[side.front], angles[side.rear], key=abs) / s
-                    side.begin(speed if self.begins else _nearer(side.expected, speed))
-                self.begins = False
-                self._begin_step()
-            else:
-                self._add(block)
-                if self.step_s >= max(BLOCK_S, (max(DEAD_TIME_S, lag) - BLOCK_S / 2) / DELAYS):
+            parts = max(1, int(s / BLOCK_S + 1e-6))
+            part = block._replace(s=s / parts, angles=times(angles, 1.0 / parts))
+            step_s = max(BLOCK_S, (max(DEAD_TIME_S, lag) - BLOCK_S / 2) / DELAYS)
+            for _ in range(parts):
+                self._follow_commands(commanded, part.s, lag)
+                if self.begins or self.late:
+                    self._begin_at(part)
+                    continue
+                self._add(part)
+                if self.step_s >= step_s - 1e-9:
                     self._obey(count)
                     self._begin_step()
         self._compare(block, kinematics)
 
+    def _follow_commands(self, commanded: WheelSpeeds, s: Seconds, lag: Seconds) -> None:
+        left, right = self.sides
+        left.expect(commanded.front_left, s, lag)
+        right.expect(commanded.front_right, s, lag)
+
+    def _begin_at(self, block: Block) -> None:
+        for side in self.sides:
+            speed = max(block.angles[side.front], block.angles[side.rear], key=abs) / block.s
+            side.begin(speed if self.begins else _nearer(side.expected, speed))
+        self.begins = False
+        self._begin_step()
+
     def _begin_step(self) -> None:
         self.step_s = 0.0
         for wheel in self.wheels:
-            wheel.turned = 0.0
+            wheel.turned = wheel.sure = 0.0
         for side in self.sides:
             side.angle = side.half_angle = side.whole_angle = 0.0
 
     def _add(self, block: Block) -> None:
         s = block.s
         self.step_s += s
+        still = all(-COMMANDED < side.command < COMMANDED for side in self.sides)
         for i, wheel in enumerate(self.wheels):
             angle, speed = block.angles[i], block.speeds[i]
             command = wheel.command = self.sides[SIDE_OF[i]].command
             wheel.turned += angle
+            play = wheel.play + angle
+            wheel.play = min(max(play, 0.0), block.unit)
+            wheel.sure += play - wheel.play
+            if not still and wheel.rested:
+                # A wheel rests with the robot: under way, a side that stands is commanded to.
+                wheel.obedience.forget()
+                wheel.missed, wheel.rested, wheel.rest_s, wheel.rest_angle = 0.0, False, 0.0, 0.0
             if not -COMMANDED < command < COMMANDED:
-                if wheel.rested:
-                    wheel.obedience.forget()
-                    wheel.missed = 0.0
-                wheel.rested, wheel.rest_s, wheel.rest_angle = False, 0.0, 0.0
+                wheel.rest_s = wheel.rest_angle = 0.0
             elif not wheel.rested:
                 _rest(wheel, angle, block)
             slack = ROUNDING * s + JITTER_S * abs(speed)
@@ -340,13 +367,15 @@ class Wheels(Struct):
         turns = speed if speed > 0.0 else -speed
         wheel.timing = TIMING_S * max(largest, turns)
         # Faster than the limiter allows; a wheel that slows down may have been faster before.
-        slows = min(0.0, turns + noise - abs(obedience.speeds[-1]))
-        fast = wheel.fast_angle + (turns + REACTION * slows - TOO_FAST * largest) * s
+        sure = wheel.sure_speed = wheel.sure_speed + (wheel.sure - wheel.sure_speed * s) * share
+        rolls = sure if sure > 0.0 else -sure
+        slows = min(0.0, rolls + noise - abs(obedience.speeds[-1]))
+        fast = wheel.fast_angle + (rolls + REACTION * slows - TOO_FAST * largest) * s
         if fast > 0.0 and not -COMMANDED < wheel.command < COMMANDED:
             wheel.fast_s, wheel.fast_angle = wheel.fast_s + s, fast
         else:
             wheel.fast_s = wheel.fast_angle = 0.0
-        obedience.add(speed, bounds, s, least + wheel.timing)
+        obedience.add(sure, turns, bounds, s, least + wheel.timing)
         more, difference = expected - angle, abs(speed - wheel.expected)
         agrees = difference <= AGREEMENT * max(turns, abs(wheel.expected))
         wheel.agrees = agrees or difference < AGREED_NOISE * noise
@@ -376,7 +405,8 @@ class Wheels(Struct):
         enough = max(TOO_FAST_ANGLE, TOO_FAST_COUNTS * count)
         fast = wheel.fast_s >= TOO_FAST_S and wheel.fast_angle >= enough
         if fast and not self._latch_swapped(i):
-            self._latch("wheel_too_fast", i, self.sides[SIDE_OF[i]].due.most)
+            largest = math.copysign(self.sides[SIDE_OF[i]].due.most, wheel.speed)
+            self._latch("wheel_too_fast", i, largest)
         obedience = wheel.obedience
         if self.standstill.why is not None:
             obedience.forget()  # one cause for all
@@ -402,7 +432,8 @@ class Wheels(Struct):
             return
         speed, command = wheel.speed, wheel.command
         due = self.sides[SIDE_OF[i]].due.in_direction_of(speed)
-        if due < AGREEMENT * abs(speed) and COMMANDED < abs(command) < abs(speed) / AGREEMENT:
+        against = command * speed < 0.0 and COMMANDED < abs(command) < abs(speed) / AGREEMENT
+        if against and due < AGREEMENT * abs(speed):
             self._latch("wheel_reversed", i, command)
         else:
             self._latch("wheel_runaway", i, command)
