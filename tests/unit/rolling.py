@@ -53,7 +53,7 @@ RIGHT: dict[Kind, set[str]] = {
 # Of the evidence for a fault, and of the way in the time by which a motion may be later than a
 # delay: what the wheels roll at most until a fault is found.
 ANGLES: dict[Kind, float] = {
-    "reversed": 1.2, "stuck": 1.2, "swapped": 2.6, "too fast": 1.6, "runaway": 2.6, "dead": 2.6,
+    "reversed": 1.8, "stuck": 1.2, "swapped": 2.6, "too fast": 4.0, "runaway": 3.0, "dead": 2.6,
     "too slow": 4.0,
 }  # fmt: skip
 
