@@ -102,6 +102,7 @@ class PoseWitness:
         """Time that a motor needs to follow its command again."""
         counts = config.get("sim", {}).get("encoder_counts")
         mcu_counts = config.get("mcu", {}).get("encoder_counts")
+        self._miscounted = bool(mcu_counts) and mcu_counts != (counts or 3200)
         turn = COARSE_COUNTS * math.tau / 96 if counts == 96 and not mcu_counts else 0.0
         self._unsure_m: float = turn * drive.get("wheel_radius", 0.05)
         """Distance that such encoders may be off, m."""
@@ -261,7 +262,8 @@ class PoseWitness:
         self, now_ns: int, at_ns: int, pose: Pose, covariance: tuple[float, ...], lies: bool
     ) -> None:
         last, self._last = self._last, (at_ns, pose)
-        if last is not None and not lies:
+        # Wrong counts look like a fast robot until they are compared with the speeds.
+        if last is not None and not lies and not self._miscounted:
             way = math.hypot(pose[0] - last[1][0], pose[1] - last[1][1])
             seconds = max(0.0, (at_ns - last[0]) / NS)
             if way > self.fastest * 1.1 * seconds + 0.05:

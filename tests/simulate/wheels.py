@@ -28,6 +28,9 @@ ROLL_RAD, ROLL_COUNTS = 1.0, 3
 
 FACTOR, TIMING_S, DEAD_TIME_NS = 2.6, 0.2, 3 * NS // 5
 
+LEAST_COUNTS = 16
+"""The counts of an encoder that the daemon assumes, if they are not configured."""
+
 ROOM_RAD, ROOM_NS = 0.2, 3 * NS // 20
 """Allowed beside these bounds: the way of a line, and the window of the board's speeds."""
 
@@ -56,6 +59,9 @@ class Wheels:
         lag_s = config.get("sim", {}).get("motor_time_constant", 0.1)
         self._response_ns = max(DEAD_TIME_NS, int(3 * max(response_s, lag_s) * NS))
         self._roll = max(ROLL_RAD, ROLL_COUNTS * math.tau / counts)
+        declared = config["mcu"].get("encoder_counts") or LEAST_COUNTS
+        self._seen = max(ROLL_RAD, ROLL_COUNTS * math.tau / min(counts, declared))
+        """A roll that the daemon's encoders show for certain, rad."""
         self._step_ns = 0
         self._commands = [0.0] * 4
         """The command at the last change of each wheel, rad/s."""
@@ -158,7 +164,7 @@ class Wheels:
             return
         self._fast_ns = self._fast_ns or at_ns
         rolled = slowest * (at_ns - self._fast_ns) / NS
-        coarse = 4 * self._roll / ROLL_RAD
+        coarse = 7 * self._seen
         if at_ns - self._fast_ns > FAST_NS + self._response_ns and rolled > coarse:
             text = f"all wheels turn at {slowest:.2f} rad/s, commanded were {fastest:.2f} rad/s"
             raise BrokenError("a robot that is too fast is stopped", at_ns, text)

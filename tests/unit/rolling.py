@@ -255,7 +255,7 @@ def restless(seed: int, seconds: float, wheels: WheelMap) -> tuple[Robot, Findin
         slope = dice.uniform(0.75, 1.15)
         bench.cap = made.speed * dice.uniform(0.2, 1.0) if dice.random() < 0.2 else math.inf
         while bench.now < until:
-            bench.gain = slope * (dice.uniform(0.6, 1.1) if dice.random() < 0.1 else 1.0)
+            bench.gain = min(1.15, slope * (dice.uniform(0.6, 1.1) if dice.random() < 0.1 else 1.0))
             bench.hold(one, each * dice.uniform(0.5, 1.5))
             bench.hold(other, each * dice.uniform(0.5, 1.5))
     return made, bench.said
@@ -270,7 +270,8 @@ def overdue(seed: int, seconds: float, wheels: WheelMap) -> tuple[Robot, Finding
         made = replace(made, lag=dice.uniform(0.05, 0.25), response_time=0.2)
     bench = Bench(made, dice, wheels=wheels)
     bench.late.extend([[0.0] * bench.driven] * round(dead * made.rate))
-    bench.coasts = min(coasts, max(1.0, max(1.2, 2.0 * made.response_time) / made.lag))
+    longest = 1.2 if made.counts >= 100 and made.declared else 0.8
+    bench.coasts = min(coasts, max(1.0, max(longest, 2.0 * made.response_time) / made.lag))
     bench.limits = brisk(bench.limits, dice.choice((1.0, 1.0, 3.0)))
     while bench.now < seconds:
         one, other = twist(dice, made), twist(dice, made)
@@ -280,7 +281,7 @@ def overdue(seed: int, seconds: float, wheels: WheelMap) -> tuple[Robot, Finding
         until, slope = bench.now + dice.uniform(2.0, 20.0), dice.uniform(0.75, 1.15)
         bench.cap = made.speed * dice.uniform(0.2, 1.0) if dice.random() < 0.2 else math.inf
         while bench.now < until:
-            bench.gain = slope * (dice.uniform(0.6, 1.1) if dice.random() < 0.1 else 1.0)
+            bench.gain = min(1.15, slope * (dice.uniform(0.6, 1.1) if dice.random() < 0.1 else 1.0))
             bench.hold(one, each * dice.uniform(0.5, 1.5))
             bench.hold(other, each * dice.uniform(0.5, 1.5))
     return made, bench.said
