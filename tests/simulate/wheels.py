@@ -142,7 +142,8 @@ class Wheels:
         self._missed[place] = 0.0
         self._witness.counts["wheels named"] += 1
         text = self._state()["wheel_fault"]
-        if not re.search(rf"\b{self._witness.names[place]} wheel is blocked", text):
+        blocked = rf"\b{self._witness.names[place]} wheel is blocked|no wheel has begun"
+        if not re.search(blocked, text):
             raise BrokenError("a wheel that does not turn is named", at_ns, f"{place}: {text!r}")
 
     def _stuck(self, at_ns: int, place: int, seconds: float, speed: float) -> None:

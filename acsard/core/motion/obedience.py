@@ -80,6 +80,7 @@ class Obedience(Struct):
     astray: list[Rad] = field(default_factory=_zeros)  # beyond what is due, or against it
     fast: list[Rad] = field(default_factory=_zeros)  # faster by more than `AGREEMENT`
     slow: list[Rad] = field(default_factory=_zeros)
+    limit: Rad = 0.0  # the last evidence for a fault
 
     @property
     def unexplained(self) -> Rad:
@@ -98,7 +99,10 @@ class Obedience(Struct):
 
         `shown` is the magnitude with the counts that a wheel shows to and fro at their edge.
         """
-        speeds, most, keep = self.speeds, MAX_EVIDENCE * limit, 1.0 - s / LEAK_S
+        speeds, most = self.speeds, MAX_EVIDENCE * limit
+        # Evidence is a share of its bound: that of a fast wheel is not beyond that of a slow one.
+        share = limit / self.limit if self.limit else 1.0
+        keep, self.limit = share * (1.0 - s / LEAK_S), limit
         speeds.insert(0, speed)
         change = REACTION * (speed - speeds.pop())
         turns = speed
@@ -113,13 +117,13 @@ class Obedience(Struct):
                 # A wheel that turns too little has rolled nothing too far.
                 beyond = beyond if beyond < turns else turns
                 # Away from what is due, a change counts as much as what is beyond it.
-                was += (beyond + (change if change < beyond else beyond)) * s
+                was = was * share + (beyond + (change if change < beyond else beyond)) * s
             else:
                 was *= keep
             astray.append(0.0 if was < 0.0 else most if was > most else was)
-            was_fast += (turns - largest) * s
+            was_fast = was_fast * share + (turns - largest) * s
             fast.append(0.0 if was_fast < 0.0 else most if was_fast > most else was_fast)
-            was_slow += (least - shown) * s
+            was_slow = was_slow * share + (least - shown) * s
             slow.append(0.0 if was_slow < 0.0 else most if was_slow > most else was_slow)
         self.astray, self.fast, self.slow = astray, fast, slow
 
