@@ -29,7 +29,7 @@ from acsard.core.motion.kinematics import Kinematics
 from acsard.core.motion.limits import coast, follow
 from acsard.core.motion.modes import Mode, RefusedError
 from acsard.core.motion.uncertainty import ErrorModel
-from acsard.core.motion.wheels import LEAST_SPEED
+from acsard.core.motion.wheels import BLOCK_S, LEAST_SPEED
 from acsard.core.reasons import reason_of
 from acsard.core.robot_memory import State, initial
 from acsard.core.values import (
@@ -437,7 +437,9 @@ class Robot:
         # Without a link the board hears nothing, and must stop the motors.
         speeds = state.out.speeds if state.session.link == "up" else STILL
         wheels.commanded = None if pressed else speeds
-        wheels.late = state.session.steps.step_s > WRITE_PAUSE_S
+        # Of the time of a silence nobody knows what the board was told.
+        silent = line.gap + line.bridged > 2 * BLOCK_S
+        wheels.late = silent or state.session.steps.step_s > WRITE_PAUSE_S
         estimate = state.odometry.fold(line, checks, self.model)
         if wheels.fault is not None:
             self._fault(wheels.fault, now, events)
