@@ -14,7 +14,7 @@ from collections.abc import Sequence
 from tests.simulate.promises import BrokenError, Witness
 from tests.simulate.roads import NS
 
-MOST_M = 2.5
+MOST_M = 4.0
 
 MEAN_NS, DIFFERS = 5 * NS, 0.5
 """Time of both means, and the share of the commanded one by which they certainly differ."""
