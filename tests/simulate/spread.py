@@ -20,8 +20,9 @@ SIZE, RATIO, TRACKS = 0.02, 0.01, {4: 0.3, 2: 0.05}
 ROOM = 10.0
 """Factor allowed beside the bound. It covers terms of second order and the shape of a path."""
 
-COUNTS_M2, COUNTS_RAD2 = 1e-4, 1e-3
-"""Allowed beside the bound, for the place of a wheel within an encoder count of 1/96 turn."""
+COUNTS_M2, COUNTS_RAD2 = 2e-3, 1e-3
+"""Allowed beside the bound, for the place of a wheel within an encoder count of 1/96 turn, and for
+lines that come late, whose time is doubted."""
 
 UNKNOWN_RAD = 1.0
 """Deviation of the heading from which on the position is not judged: terms of second order, which

@@ -403,10 +403,10 @@ class Wheels(Struct):
 
     def _pace(self, i: int, wheel: Wheel, count: Rad) -> None:
         enough = max(TOO_FAST_ANGLE, TOO_FAST_COUNTS * count)
+        largest = self.sides[SIDE_OF[i]].due.most
         fast = wheel.fast_s >= TOO_FAST_S and wheel.fast_angle >= enough
-        if fast and not self._latch_swapped(i):
-            largest = math.copysign(self.sides[SIDE_OF[i]].due.most, wheel.speed)
-            self._latch("wheel_too_fast", i, largest)
+        if fast and abs(wheel.sure_speed) > TOO_FAST * largest and not self._latch_swapped(i):
+            self._latch("wheel_too_fast", i, math.copysign(largest, wheel.speed))
         obedience = wheel.obedience
         if self.standstill.why is not None:
             obedience.forget()  # one cause for all
