@@ -181,7 +181,7 @@ class Wheels(Struct):
         self._begin()
 
     def pause(self) -> None:
-        """End the block: there is no link. What was due and what was found stays."""
+        """Discard the lines of the open block: there is no link. Keep the evidence until then."""
         self._begin()
 
     def forget(self) -> None:
