@@ -29,7 +29,7 @@ from acsard.core.motion.kinematics import Kinematics
 from acsard.core.motion.limits import coast, follow
 from acsard.core.motion.modes import Mode, RefusedError
 from acsard.core.motion.uncertainty import ErrorModel
-from acsard.core.motion.wheels import BLOCK_S, LEAST_SPEED
+from acsard.core.motion.wheels import LEAST_SPEED
 from acsard.core.reasons import reason_of
 from acsard.core.robot_memory import State, initial
 from acsard.core.values import (
@@ -318,7 +318,7 @@ class Robot:
                 if session.steps.late_s:
                     state.count("link_lost_host_stall")
             state.sanity.forget()
-            state.checks.wheels.pause()
+        state.checks.wheels.tell(state.out.speeds)
         if session.restarted:
             # No sender drives before the link is up for the first time, so accept a zero that was
             # sent during the start.
@@ -438,8 +438,10 @@ class Robot:
         speeds = state.out.speeds if state.session.link == "up" else STILL
         wheels.commanded = None if pressed else speeds
         # Of the time of a silence nobody knows what the board was told.
-        silent = line.gap + line.bridged > 2 * BLOCK_S
-        wheels.late = silent or state.session.steps.step_s > WRITE_PAUSE_S
+        passed = line.dt + line.gap
+        silent = passed > self.link_setup.covered_s
+        late = silent or state.session.steps.step_s > WRITE_PAUSE_S
+        wheels.unseen = passed if late else 0.0
         estimate = state.odometry.fold(line, checks, self.model)
         if wheels.fault is not None:
             self._fault(wheels.fault, now, events)

@@ -138,6 +138,7 @@ class Bench:
         self.late: deque[list[float]] = deque()  # commands that the motors do not see yet
         self.coasts = 1.0  # how much slower motors slow down than they speed up
         self.linked = True
+        self.unseen, self.missed = 0.0, [0.0] * self.driven  # s and rad since the last line
         self.excess = 0.0  # m that the motors which keep their speed rolled beyond their command
 
     def step(self, wished: Twist) -> None:
@@ -175,13 +176,18 @@ class Bench:
             counts = 0 if i in self.dead else counts * self.signs.get(i, 1)
             speeds[i] = self.frozen.get(i, round(counts * self.unit / dt, 2))
             turned[i] = speeds[i] * dt
+        self.missed = [a + b for a, b in zip(self.missed, turned, strict=True)]
         if not self.linked:
+            self.unseen += dt
             return
+        # A line that ends a silence has the counts of all of it.
+        turned, passed = self.missed, self.unseen + dt
         reported = WheelSpeeds(*of_four(speeds))
         wheels, said = self.wheels, self.said
-        wheels.commanded = commanded
+        wheels.commanded, wheels.unseen = commanded, passed if self.unseen else 0.0
+        self.unseen, self.missed = 0.0, [0.0] * self.driven
         wheels.add(
-            of_four(turned), reported, dt, None, self.feedback, self.kinematics, self.count,
+            of_four(turned), reported, passed, None, self.feedback, self.kinematics, self.count,
         )  # fmt: skip
         for event in wheels.events:
             said.first.setdefault(event.code or event.kind, self.now)
@@ -327,10 +333,7 @@ def to_and_fro(seed: int, wheels: WheelMap, flickers: bool) -> tuple[Robot, Benc
         for wish, seconds in (one, other):
             until = bench.now + seconds
             while bench.now < until and not bench.said.faults:
-                linked = not flickers or (bench.now - began) % FLICKERS_S >= FLICKER_S
-                if bench.linked and not linked:
-                    bench.wheels.pause()
-                bench.linked = linked
+                bench.linked = not flickers or (bench.now - began) % FLICKERS_S >= FLICKER_S
                 bench.step(Twist(wish))
     return made, bench
 

@@ -49,7 +49,7 @@ class Bench:
         command: WheelSpeeds | float | None = None,
         seconds: float = PERIOD,
         turn: float | None = None,
-        late: bool = False,
+        unseen: bool = False,
         noise: float = 0.0,
         each: float = PERIOD,
         until_fault: bool = False,
@@ -65,7 +65,7 @@ class Bench:
             a, b, c, d = (s + more * (s != 0.0) for s in speeds_of(speeds).as_tuple())
             turned = a * each, b * each, c * each, d * each
             by_gyro = None if turn is None else turn * each
-            wheels.commanded, wheels.late = wanted, late
+            wheels.commanded, wheels.unseen = wanted, each if unseen else 0.0
             reported = WheelSpeeds(a, b, c, d)
             wheels.add(turned, reported, each, by_gyro, self.feedback, self.kinematics, self.count)
             if wheels.status.excluded != before:
@@ -268,7 +268,7 @@ def test_what_sound_robots_do_is_no_fault() -> None:
         lowered.run(speed, command)
     # A board that stopped its motors in a stall: the lines of that time wait.
     again = Bench().driven()
-    again.run(0.0, 10.0, 0.5, late=True)
+    again.run(0.0, 10.0, 0.5, unseen=True)
     for step in range(100):
         again.run(0.09 * step, 0.1 * step)
     blind = Bench(encoders=False)

@@ -59,6 +59,7 @@ class Side(Struct):
     expected: RadPerS = 0.0  # behind the whole response time
     halfway: RadPerS = 0.0  # behind half of it
     due: Expected = field(default_factory=Expected)
+    told: tuple[RadPerS, RadPerS] = (0.0, 0.0)  # least and largest command since the last block
     angle: Rad = 0.0  # commanded since the last step, and the same behind the lags
     half_angle: Rad = 0.0
     whole_angle: Rad = 0.0
@@ -88,20 +89,24 @@ class Side(Struct):
         """Add what a wheel that follows the command behind a lag rolls in a block."""
         # Exact for a command that is constant in the block; the mean of two is, in a ramp.
         goal, self.command = (self.command + command) / 2, command
+        self.told = command, command
         self.angle += goal * s
         self.expected, angle = _lagged(self.expected, goal, s, lag)
         self.whole_angle += angle
         self.halfway, angle = _lagged(self.halfway, goal, s, lag / 2)
         self.half_angle += angle
 
-    def remember(self, s: Seconds, share: float) -> None:
-        """End a step of `s` seconds, and smooth its speeds as the measured ones are."""
+    def remember(self, s: Seconds, share: float, *before: RadPerS) -> None:
+        """End a step of `s` seconds, and smooth its speeds as the measured ones are.
+
+        If no line tells of the step, the wheels may have had the speeds `before`, or none.
+        """
         command, half, whole = self.smooth
         command += (self.angle - command * s) * share
         half += (self.half_angle - half * s) * share
         whole += (self.whole_angle - whole * s) * share
         self.smooth = command, half, whole
-        self.due.add(command, half, whole)
+        self.due.add(command, half, whole, *before, *before and (0.0,))
         self.angle = self.half_angle = self.whole_angle = 0.0
 
     def begin(self, speed: RadPerS) -> None:

@@ -13,6 +13,7 @@ and by a gyro.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 from msgspec import Struct, field
 
@@ -54,6 +55,7 @@ from acsard.core.values import (
 )
 
 BLOCK_S = 0.05
+FILLED_S = 1.0  # the longest silence whose ends are evidence of the motion in it
 # The longest time for which one line is evidence: the longest `mcu.reply_period`. A line may also
 # cover a stall. It is as many blocks as it has times of `BLOCK_S`, or its delays were too long.
 MAX_BLOCK_S = 0.25
@@ -120,7 +122,8 @@ class Wheels(Struct):
     sides: tuple[Side, Side]
     # Commanded speeds; the caller sets these three. None: the emergency stop may cut the power.
     commanded: WheelSpeeds | None = STILL
-    late: bool = False  # this computer was late, so the board may have stopped the motors
+    # For which the last line does not tell what the wheels did: lines or commands are missing.
+    unseen: Seconds = 0.0
     begins: bool = True  # the expected speeds begin at the measured ones
     angles: Wheels4 = NOTHING  # of the block, rad
     turn: Rad = 0.0  # of the block by a gyro
@@ -154,6 +157,11 @@ class Wheels(Struct):
 
         `count` is the angle of an encoder count (`count_angle`).
         """
+        self.events, self.fault, self.pushed, self.repair = (), None, "", NOTHING
+        self.gives_up = False
+        if self.unseen:
+            self.unseen += self.seconds
+            self._begin()
         front_right, front_left, rear_left, rear_right = self.angles
         first, second, third, fourth = turned
         front_right += first
@@ -167,12 +175,17 @@ class Wheels(Struct):
             self.by_gyro = False
         else:
             self.turn += turn
-        self.events, self.fault, self.pushed, self.repair = (), None, "", NOTHING
-        self.gives_up = False
         most = self.max_difference
-        if seconds < BLOCK_S and (
-            self.lines == 1
-            or (-most < front_left - rear_left < most and -most < front_right - rear_right < most)
+        if (
+            not self.unseen
+            and seconds < BLOCK_S
+            and (
+                self.lines == 1
+                or (
+                    -most < front_left - rear_left < most
+                    and -most < front_right - rear_right < most
+                )
+            )
         ):
             return
         if feedback.encoders and seconds > 0.0:
@@ -180,9 +193,10 @@ class Wheels(Struct):
             self._end_block(turned, speeds.as_tuple(), feedback.response_time, kinematics, count)
         self._begin()
 
-    def pause(self) -> None:
-        """Discard the lines of the open block: there is no link. Keep the evidence until then."""
-        self._begin()
+    def tell(self, commanded: WheelSpeeds) -> None:
+        """Take a command that is written, with or without lines: the wheels may follow it."""
+        for side, speed in zip(self.sides, _of_sides(commanded), strict=True):
+            side.told = min(side.told[0], speed), max(side.told[1], speed)
 
     def forget(self) -> None:
         """Drop the evidence of faults: one was cleared."""
@@ -270,11 +284,14 @@ class Wheels(Struct):
             parts = max(1, int(s / BLOCK_S + 1e-6))
             part = block._replace(s=s / parts, angles=times(angles, 1.0 / parts))
             step_s = max(BLOCK_S, (max(DEAD_TIME_S, lag) - BLOCK_S / 2) / DELAYS)
+            if self.unseen:
+                self._pass(step_s, lag, block)
+            if self.begins or self.unseen:
+                self._follow_commands(commanded, s, lag)
+                self._begin_at(part)
+                parts = 0
             for _ in range(parts):
                 self._follow_commands(commanded, part.s, lag)
-                if self.begins or self.late:
-                    self._begin_at(part)
-                    continue
                 self._add(part)
                 if self.step_s >= step_s - 1e-9:
                     self._obey(count)
@@ -282,9 +299,28 @@ class Wheels(Struct):
         self._compare(block, kinematics)
 
     def _follow_commands(self, commanded: WheelSpeeds, s: Seconds, lag: Seconds) -> None:
-        left, right = self.sides
-        left.expect(commanded.front_left, s, lag)
-        right.expect(commanded.front_right, s, lag)
+        for side, speed in zip(self.sides, _of_sides(commanded), strict=True):
+            side.expect(speed, s, lag)
+
+    def _pass(self, step_s: Seconds, lag: Seconds, block: Block) -> None:
+        # Let time pass that no line tells of. The wheels did what was due or what was due before,
+        # or stopped. Of the speeds at both ends of a short silence, the slower one is evidence.
+        assert self.commanded is not None
+        s = self.unseen
+        if self.step_s:
+            s -= step_s - self.step_s
+            self._obey(block.unit)
+        short, ends = s <= FILLED_S, zip(self.wheels, block.speeds, strict=False)
+        speeds = [_nearer(wheel.speed, speed) if short else 0.0 for wheel, speed in ends]
+        before = [(*side.told, *side.smooth) for side in self.sides]
+        for _ in range(min(DELAYS + 1, int(s / step_s + 1e-6))):
+            self._begin_step()
+            self._follow_commands(self.commanded, step_s, lag)
+            for wheel, speed in zip(self.wheels, speeds, strict=True):
+                wheel.turned = wheel.sure = speed * step_s
+            self.step_s = step_s
+            self._obey(block.unit, before)
+        self._begin_step()
 
     def _begin_at(self, block: Block) -> None:
         for side in self.sides:
@@ -326,16 +362,16 @@ class Wheels(Struct):
                 wheel.same_s, wheel.reported = 0.0, speed
         self._check_standstill(block)
 
-    def _obey(self, count: Rad) -> None:
+    def _obey(self, count: Rad, before: Sequence[tuple[RadPerS, ...]] = ((), ())) -> None:
         s, fastest, least = self.step_s, 0.0, max(FAULT_ANGLE, FAULT_COUNTS * count)
-        for side in self.sides:
+        for side, speeds in zip(self.sides, before, strict=True):
             size = max(abs(side.angle) / s, *[abs(self.wheels[i].speed) for i in side.wheels])
             smoothed = SMOOTHED_S
             if size * SMOOTHED_S > SMOOTHED_COUNTS * count:
                 smoothed = SMOOTHED_COUNTS * count / size
             share = 1.0 / (smoothed + s)
             whole = side.whole_angle
-            side.remember(s, share)
+            side.remember(s, share, *speeds)
             noise = NOISE_COUNTS * count * share
             bounds = side.due.bounds(noise)
             for i in side.wheels:
@@ -553,6 +589,10 @@ def new_wheels(independent: int) -> Wheels:
 def count_angle(counts: int) -> Rad:
     """Return the angle of an encoder count; `counts` per turn are 0 if they are unknown."""
     return math.tau / (counts or ASSUMED_COUNTS)
+
+
+def _of_sides(speeds: WheelSpeeds) -> tuple[RadPerS, RadPerS]:
+    return speeds.front_left, speeds.front_right
 
 
 def _rest(wheel: Wheel, angle: Rad, block: Block) -> None:

@@ -1,0 +1,80 @@
+"""A link that is lost and found many times a second hides no runaway, and makes none."""
+
+from __future__ import annotations
+
+import random
+from contextlib import nullcontext
+
+import pytest
+
+from acsard.core.config.settings import Config, McuConfig, SimConfig, WheelMap
+from acsard.core.values import NS_PER_S
+from tests.scenarios.world import World
+from tests.wheels import four_and_two
+
+COUNTS = 16, 20, 48, 400, 3200
+
+
+def flickering(
+    counts: int, wheels: WheelMap, *, declared: bool = True, checked: bool = False
+) -> World:
+    mcu = McuConfig(
+        encoder_counts=counts if declared else 0, link_check="on" if checked else "off",
+        wheels=wheels,
+    )  # fmt: skip
+    world = World(Config(mcu=mcu, sim=SimConfig(encoder_counts=counts)))
+    world.run(0.2)
+    return world
+
+
+def faults(world: World) -> list[str]:
+    return [cause.code for cause in world.state.causes if cause.code.startswith("wheel")]
+
+
+@pytest.mark.parametrize("counts", [20, 400])
+@pytest.mark.parametrize("lines_s", [0.05, 0.1, 0.3])
+@pytest.mark.parametrize("silent_s", [0.13, 0.2, 0.5])
+@four_and_two
+def test_a_runaway_behind_silences_is_found_within_two_metres(
+    silent_s: float, lines_s: float, counts: int, wheels: WheelMap
+) -> None:
+    """Time passes without lines, too: what was due before a stop is not due for ever."""
+    world = flickering(counts, wheels)
+    world.drive(0.5, seconds=2.0)
+    mcu = world.mcu
+    began = mcu.vehicle.pose.x
+    with mcu.fault("pushed", 0.5):
+        world.call("stop")
+        while not faults(world) and mcu.vehicle.pose.x - began < 2.0:
+            with mcu.fault("mute"):
+                world.run(silent_s)
+            world.run(lines_s)
+    assert faults(world)[0] == "wheel_runaway"
+
+
+@pytest.mark.parametrize(
+    "seed",
+    [*range(12), *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(12, 60))],
+)
+@four_and_two
+def test_a_sound_robot_behind_silences_latches_no_fault(seed: int, wheels: WheelMap) -> None:
+    """Only the board is silent, or the computer stalls, or both."""
+    dice = random.Random(seed)
+    checked, declared = dice.random() < 0.5, dice.random() < 0.6
+    world = flickering(dice.choice(COUNTS), wheels, declared=declared, checked=checked)
+    silent, lines = dice.uniform(0.05, 0.5), dice.uniform(0.05, 0.5)
+    mute, stall = dice.choice([(True, False), (False, True), (True, True)])
+    world.drive(0.3, seconds=1.0)
+    end_ns = world.now_ns + 20 * NS_PER_S
+    while world.now_ns < end_ns:
+        wish = dice.choice([(0.5, 0.0), (dice.uniform(-1, 1), dice.uniform(-2, 2))])
+        for _ in range(dice.randrange(1, 6)):
+            seconds = silent * dice.uniform(0.7, 1.3)
+            with world.mcu.fault("mute") if mute else nullcontext():
+                if stall:
+                    world.stall(seconds)
+                else:
+                    world.hold(*wish, seconds=seconds)
+            world.send(*wish)
+            world.hold(*wish, seconds=lines * dice.uniform(0.7, 1.3))
+            assert not faults(world), world.state.reason
