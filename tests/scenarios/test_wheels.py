@@ -21,11 +21,11 @@ from acsard.core.config.settings import (
     WheelMap,
 )
 from acsard.core.motion.obedience import DEAD_TIME_S
+from acsard.core.motion.wheel import TIMING_S
 from acsard.core.motion.wheels import (
     BLOCK_S,
     FAULT_ANGLE,
     FAULT_COUNTS,
-    TIMING_S,
     count_angle,
 )
 from acsard.core.simulator.protocol import speeds_text

@@ -76,12 +76,13 @@ LOOP, PUBLICATION = "daemon/control_loop.py", "daemon/publication.py"
 CODEC, SESSION = "core/link/codec.py", "core/link/session.py"
 (
     AGES, ARBITER, BATTERY, BUMPERS, EMERGENCY_STOP, GYRO, KINEMATICS, LATCHES, LIFECYCLE, LIMITS,
-    MODES, NEUTRAL, OBEDIENCE, ODOMETRY, UNCERTAINTY, WHEELS_LAW,
+    MODES, NEUTRAL, OBEDIENCE, ODOMETRY, UNCERTAINTY, WHEEL, WHEELS_LAW,
 ) = (
     f"core/motion/{name}.py"
     for name in (
         "ages", "arbiter", "battery", "bumpers", "emergency_stop", "gyro", "kinematics", "latches",
-        "lifecycle", "limits", "modes", "neutral", "obedience", "odometry", "uncertainty", "wheels",
+        "lifecycle", "limits", "modes", "neutral", "obedience", "odometry", "uncertainty", "wheel",
+        "wheels",
     )
 )  # fmt: skip
 
@@ -377,10 +378,10 @@ FAULTS = (
     # sanity
     fault("wheel runaway", "a wheel that rolls on after a stop is never a fault", WHEELS_LAW,
           "if wheel.obedience.unexplained >= least + wheel.timing:", "if False:"),
-    fault("wheel fast", "a robot that is faster than its limiter is never a fault", WHEELS_LAW,
-          "fast = wheel.fast_s >= TOO_FAST_S and", "fast = False and"),
-    fault("wheel blocked", "a wheel that does not turn is not reported", WHEELS_LAW,
-          "slow, beyond = min(obedience.slow),", "slow, beyond = 0.0,"),
+    fault("wheel fast", "a robot that is faster than its limiter is never a fault", WHEEL,
+          "fast = self.fast_s >= TOO_FAST_S and", "fast = False and"),
+    fault("wheel blocked", "a wheel that does not turn is not reported", WHEEL,
+          "slow, beyond = min(self.obedience.slow),", "slow, beyond = 0.0,"),
     fault("wheel reversed", "a wheel that turns the wrong way is never a fault", WHEELS_LAW,
           'self._latch("wheel_reversed", i, command)', "pass"),
     # bus
@@ -450,7 +451,7 @@ FAULTS = (
           Edit("core/link/link_state.py", "CHECKED_LINES = 3, 1", "CHECKED_LINES = 3, 2")),
     fault("wheel stuck", "a wheel that seems not to turn is neither left out nor named",
           "core/motion/sides.py", "OUT_BLOCKS = 2\n", "OUT_BLOCKS = 1_000_000\n",
-          Edit(WHEELS_LAW, "slow, beyond = min(obedience.slow), min(obedience.fast)",
+          Edit(WHEEL, "slow, beyond = min(self.obedience.slow), min(self.obedience.fast)",
           "slow = beyond = 0.0")),
     fault("counts wrong", "counts that contradict the speeds of their lines are believed",
           "core/link/board_counts.py", "= 0.03, 2, 0.005, 0.25", "= 30.0, 2, 0.005, 0.25"),
@@ -486,7 +487,7 @@ FAULTS = (
           EMERGENCY_STOP, "not (pressed or self.unpowered)", "not pressed"),
     fault("wheel press",
           "a wheel that rested during a press and is then turned by hand is a runaway", WHEELS_LAW,
-          "                _rest(wheel, angle, block)\n        else:",
+          "                wheel.rest(angle, block)\n        else:",
           "                pass\n        else:"),
     fault("driver cut", "a fault of a motor driver stops the robot without a ramp", ROBOT,
         "            self._fault(DRIVER_FAULT_REASON, now, events)\n",

@@ -18,10 +18,10 @@ from acsard.core.config.settings import DriveConfig, FeedbackConfig, LimitsConfi
 from acsard.core.motion.kinematics import Kinematics
 from acsard.core.motion.limits import follow
 from acsard.core.motion.obedience import DEAD_TIME_S
+from acsard.core.motion.wheel import TIMING_S
 from acsard.core.motion.wheels import (
     FAULT_ANGLE,
     FAULT_COUNTS,
-    TIMING_S,
     Wheels,
     count_angle,
     new_wheels,

@@ -26,8 +26,6 @@ from acsard.core.motion.obedience import (
     DEAD_TIME_S,
     DELAYS,
     NOISE_COUNTS,
-    REACTION,
-    Bounds,
     Obedience,
 )
 from acsard.core.motion.sides import (
@@ -40,6 +38,7 @@ from acsard.core.motion.sides import (
     SideName,
 )
 from acsard.core.motion.standstill import COMMANDED, Standstill
+from acsard.core.motion.wheel import REST_S, Wheel
 from acsard.core.values import (
     STILL,
     TWO_WHEELS,
@@ -60,23 +59,13 @@ FILLED_S = 1.0  # the longest silence whose ends are evidence of the motion in i
 # cover a stall. It is as many blocks as it has times of `BLOCK_S`, or its delays were too long.
 MAX_BLOCK_S = 0.25
 
-FAULT_ANGLE, FAULT_COUNTS = 1.0, 3.0  # rad and counts, both of them
-# Beyond these, of the largest speed: by so much may the motion be earlier or later than a delay.
-TIMING_S = 0.2
-AGREED_NOISE = 0.1  # of the noise of a smoothed speed: it may be the rest of one count
+FAULT_ANGLE, FAULT_COUNTS = 1.0, 3.0  # rad and counts, both of them, and `TIMING_S`
 
 # The smoothed speed covers this many counts, within the longest time: a coarse encoder reports no
 # motion in most lines.
 SMOOTHED_COUNTS, SMOOTHED_S = 3.0, 1.0
 
-REST_S, REST_ANGLE = 0.5, 0.02  # at least, without a command: the wheel rests
 LEAST_SPEED = 0.05  # m/s, of a runaway that must not look like rest
-
-# Times the largest output of the limiter, and rad and counts rolled beyond that, both of them: a
-# sound wheel shows up to a count more than it turned.
-TOO_FAST, TOO_FAST_S, TOO_FAST_ANGLE, TOO_FAST_COUNTS = 1.2, 1.0, 0.3, 2.5
-ROUNDING = 0.006  # rad/s, of a reported speed
-JITTER_S = 0.004  # of the times of lines
 
 REPEATED_S = 1.0  # between two reports of motion without a command
 
@@ -88,31 +77,6 @@ ASSUMED_COUNTS = 16
 SIDE_OF, ACROSS = (1, 0, 0, 1), (1, 0, 3, 2)  # each wheel's side, and wheel on the other one
 
 NOTHING: Wheels4 = (0.0, 0.0, 0.0, 0.0)
-
-
-class Wheel(Struct):
-    command: RadPerS = 0.0
-    speed: RadPerS = 0.0  # smoothed
-    expected: RadPerS = 0.0  # smoothed alike
-    turned: Rad = 0.0  # since the last step
-    sure: Rad = 0.0  # the same, but not within a count: at its edge, a wheel shows it to and fro
-    sure_speed: RadPerS = 0.0  # smoothed
-    play: Rad = 0.0  # how far the wheel may turn back within a count
-    agrees: bool = True
-    obedience: Obedience = field(default_factory=Obedience)
-    rolled: Rad = 0.0  # either way, while it is faster or slower than expected
-    due: Rad = 0.0  # what was due meanwhile
-    timing: Rad = 0.0  # by which a sound wheel may be earlier or later than expected
-    missed: Rad = 0.0  # expected minus measured since both agreed
-    rested: bool = True  # and was not commanded since then
-    rest_s: Seconds = 0.0
-    rest_angle: Rad = 0.0
-    fast_s: Seconds = 0.0  # faster than the limiter allows
-    fast_angle: Rad = 0.0  # rolled beyond that
-    doubted: bool = False  # by a latched fault, until it is cleared: the pose may have all of it
-    reported: RadPerS = 0.0  # in the last line
-    same_s: Seconds = 0.0  # for which it repeats this speed
-    warning: Code | None = None
 
 
 class Wheels(Struct):
@@ -244,7 +208,7 @@ class Wheels(Struct):
         slipping = [side for side in self.sides if side.slip_s]
         texts = [side.out_text for side in out] + [side.slip_text for side in slipping]
         named = zip(self.names, self.wheels, strict=True)
-        texts += [_text(wheel, name) for name, wheel in named if wheel.warning]
+        texts += [wheel.text(name) for name, wheel in named if wheel.warning]
         if self.standstill.why is not None:
             texts.append(self.standstill.why.text)
         excluded, names = [WHEELS[side.out] for side in out], [side.name for side in slipping]
@@ -279,7 +243,7 @@ class Wheels(Struct):
                     side.remember(self.step_s, 1.0 / self.step_s)
                 self._begin_step()
             for wheel, angle in zip(self.wheels, angles, strict=False):
-                _rest(wheel, angle, block)
+                wheel.rest(angle, block)
         else:
             parts = max(1, int(s / BLOCK_S + 1e-6))
             part = block._replace(s=s / parts, angles=times(angles, 1.0 / parts))
@@ -341,25 +305,8 @@ class Wheels(Struct):
         self.step_s += s
         still = all(-COMMANDED < side.command < COMMANDED for side in self.sides)
         for i, wheel in enumerate(self.wheels):
-            angle, speed = block.angles[i], block.speeds[i]
-            command = wheel.command = self.sides[SIDE_OF[i]].command
-            wheel.turned += angle
-            play = wheel.play + angle
-            wheel.play = min(max(play, 0.0), block.unit)
-            wheel.sure += play - wheel.play
-            if not still and wheel.rested:
-                # A wheel rests with the robot: under way, a side that stands is commanded to.
-                wheel.obedience.forget()
-                wheel.missed, wheel.rested, wheel.rest_s, wheel.rest_angle = 0.0, False, 0.0, 0.0
-            if not -COMMANDED < command < COMMANDED:
-                wheel.rest_s = wheel.rest_angle = 0.0
-            elif not wheel.rested:
-                _rest(wheel, angle, block)
-            slack = ROUNDING * s + JITTER_S * abs(speed)
-            if speed == wheel.reported != 0.0 and abs(angle - speed * s) < slack:
-                wheel.same_s += s
-            else:
-                wheel.same_s, wheel.reported = 0.0, speed
+            command = self.sides[SIDE_OF[i]].command
+            wheel.add(block.angles[i], block.speeds[i], command, block, not still)
         self._check_standstill(block)
 
     def _obey(self, count: Rad, before: Sequence[tuple[RadPerS, ...]] = ((), ())) -> None:
@@ -375,7 +322,10 @@ class Wheels(Struct):
             noise = NOISE_COUNTS * count * share
             bounds = side.due.bounds(noise)
             for i in side.wheels:
-                self._follow(i, whole, share, noise, bounds, least)
+                wheel = self.wheels[i]
+                more = wheel.follow(side, whole, s, share, noise, bounds, least)
+                if wheel.doubted and more:
+                    self._doubt(i, more)
         for i, wheel in enumerate(self.wheels):
             if not wheel.rested:
                 self._pace(i, wheel, count)
@@ -392,32 +342,6 @@ class Wheels(Struct):
             self.pushed = (
                 f"wheels turn at {fastest:.1f} rad/s without a command: is the robot being pushed?"
             )
-
-    def _follow(
-        self, i: int, expected: Rad, share: float, noise: RadPerS, bounds: list[Bounds], least: Rad
-    ) -> None:
-        s, wheel, side = self.step_s, self.wheels[i], self.sides[SIDE_OF[i]]
-        obedience, angle, largest = wheel.obedience, wheel.turned, side.due.most
-        speed = wheel.speed = wheel.speed + (angle - wheel.speed * s) * share
-        wheel.expected = side.smooth[-1]
-        turns = speed if speed > 0.0 else -speed
-        wheel.timing = TIMING_S * max(largest, turns)
-        # Faster than the limiter allows; a wheel that slows down may have been faster before.
-        sure = wheel.sure_speed = wheel.sure_speed + (wheel.sure - wheel.sure_speed * s) * share
-        rolls = sure if sure > 0.0 else -sure
-        slows = min(0.0, rolls + noise - abs(obedience.speeds[-1]))
-        fast = wheel.fast_angle + (rolls + REACTION * slows - TOO_FAST * largest) * s
-        if fast > 0.0 and not -COMMANDED < wheel.command < COMMANDED:
-            wheel.fast_s, wheel.fast_angle = wheel.fast_s + s, fast
-        else:
-            wheel.fast_s = wheel.fast_angle = 0.0
-        obedience.add(sure, turns, bounds, s, least + wheel.timing)
-        more, difference = expected - angle, abs(speed - wheel.expected)
-        agrees = difference <= AGREEMENT * max(turns, abs(wheel.expected))
-        wheel.agrees = agrees or difference < AGREED_NOISE * noise
-        wheel.missed = 0.0 if wheel.agrees else wheel.missed + more
-        if wheel.doubted and more:
-            self._doubt(i, more)
 
     def _check_standstill(self, block: Block) -> None:
         left, right = self.sides
@@ -438,29 +362,14 @@ class Wheels(Struct):
             self.events = (*self.events, Event("wheel_fault", "a wheel turns again", kind="again"))
 
     def _pace(self, i: int, wheel: Wheel, count: Rad) -> None:
-        enough = max(TOO_FAST_ANGLE, TOO_FAST_COUNTS * count)
         largest = self.sides[SIDE_OF[i]].due.most
-        fast = wheel.fast_s >= TOO_FAST_S and wheel.fast_angle >= enough
-        if fast and abs(wheel.sure_speed) > TOO_FAST * largest and not self._latch_swapped(i):
+        if wheel.too_fast(largest, count) and not self._latch_swapped(i):
             self._latch("wheel_too_fast", i, math.copysign(largest, wheel.speed))
-        obedience = wheel.obedience
         if self.standstill.why is not None:
-            obedience.forget()  # one cause for all
-        slow, beyond = min(obedience.slow), min(obedience.fast)
-        if slow or beyond:
-            wheel.rolled += abs(wheel.turned)
-            wheel.due += abs(wheel.expected) * self.step_s
-        else:
-            wheel.rolled = wheel.due = 0.0
-        if -COMMANDED < wheel.command < COMMANDED or self.standstill.none_s:
-            return
-        if beyond >= count + wheel.timing:
-            self._warn(i, wheel, wheel.warning or "wheel_fast")
-        elif slow >= count + wheel.timing:
-            stands = abs(wheel.speed) < AGREEMENT * abs(wheel.command)
-            self._warn(i, wheel, "wheel_blocked" if stands else wheel.warning or "wheel_slow")
-        elif wheel.agrees and not slow and not beyond:
-            self._warn(i, wheel, None)
+            wheel.obedience.forget()  # one cause for all
+        warning = wheel.pace(count, self.step_s)
+        if not self.standstill.none_s:
+            self._warn(i, wheel, warning)
 
     def _disobeys(self, i: int, wheel: Wheel) -> None:
         # One cause is enough: the robot stops.
@@ -498,9 +407,8 @@ class Wheels(Struct):
             f"measured {one.speed:.2f} and {other.speed:.2f} rad/s)"
         )
         self.fault = joined(reason("wheels_swapped", part=names, wheels=names, figures=figures))
-        for wheel in (one, other):
-            wheel.obedience.forget()
-            wheel.fast_s = wheel.fast_angle = 0.0
+        one.forget()
+        other.forget()
         return True
 
     def _latch(self, code: Code, i: int, command: RadPerS) -> None:
@@ -511,9 +419,7 @@ class Wheels(Struct):
         if not wheel.doubted:
             wheel.doubted = True
             self._doubt(i, wheel.missed)
-        # Another fault needs new evidence: the robot stops now.
-        wheel.obedience.forget()
-        wheel.fast_s = wheel.fast_angle = 0.0
+        wheel.forget()
 
     def _doubt(self, i: int, angle: Rad) -> None:
         # What a wheel with a latched fault showed otherwise than expected, which the pose has. Of
@@ -534,7 +440,7 @@ class Wheels(Struct):
             text = f"{self.names[i]} wheel obeys its command again"
             event = Event("wheel_fault", text, kind="again")
         else:
-            event = _warning(_text(wheel, self.names[i]), code)
+            event = _warning(wheel.text(self.names[i]), code)
         self.events = (*self.events, event)
 
     def _miss(self, side: Side, count: Rad) -> None:
@@ -595,16 +501,6 @@ def _of_sides(speeds: WheelSpeeds) -> tuple[RadPerS, RadPerS]:
     return speeds.front_left, speeds.front_right
 
 
-def _rest(wheel: Wheel, angle: Rad, block: Block) -> None:
-    wheel.rest_angle += angle
-    wheel.rest_s += block.s
-    if abs(wheel.rest_angle) > 1.01 * block.unit + REST_ANGLE:
-        wheel.rest_s = wheel.rest_angle = 0.0
-    elif wheel.rest_s >= block.rest:
-        wheel.rested, wheel.rest_s, wheel.rest_angle = True, 0.0, 0.0
-        wheel.obedience.forget()
-
-
 def _nearer(one: RadPerS, other: RadPerS) -> RadPerS:
     return min(one, other, key=abs) if one * other > 0.0 else 0.0
 
@@ -616,9 +512,3 @@ def _wheels4(values: list[float]) -> Wheels4:
 
 def _warning(text: str, code: Code) -> Event:
     return Event("wheel_fault", text, "warning", kind=code, code=code)
-
-
-def _text(wheel: Wheel, name: str) -> str:
-    assert wheel.warning is not None
-    share = wheel.rolled / wheel.due if wheel.due else 0.0
-    return joined(reason(wheel.warning, wheel=name, share=f"{share:.0%}")).text
