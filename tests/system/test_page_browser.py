@@ -14,6 +14,7 @@ from pathlib import Path
 
 import pytest
 
+from acsard.cli import command_line
 from acsard.machine.authority import Authority
 from acsard.web.viewer import PING_INTERVAL_S
 from tests.system.browser import NAME, TRUSTING, Page, text
@@ -151,10 +152,15 @@ SET = """(() => {
     const button = document.querySelector('[aria-label="Set limits.linear_speed"]');
     if (!button) return false;
     button.parentElement.querySelector('input').value = '0,31';
+    button.focus();
     button.click();
     return true;
 })()"""
 """Decimal comma, as people in many countries type it."""
+
+KEPT = """[...document.querySelectorAll('#settings code')].filter(
+    code => getComputedStyle(code).display !== 'none').map(code => code.textContent)"""
+"""The commands that keep a value: of the row with the focus."""
 
 ADDED = """document.head.append(Object.assign(document.createElement('script'),
     {textContent: 'window.added = true'})), window.added ?? false"""
@@ -167,6 +173,9 @@ def test_settings_reach_the_robot_and_text_of_strangers_is_only_shown(phone: Pho
     until(lambda: browser.js(SET), 5.0, "the setting is there")
     until(lambda: bus.get("config")["limits"]["linear_speed"] == 0.31, 5.0, "it is set")
     phone.shows("set-answer", "0.31")
+    kept = "acsard set limits.linear_speed 0.31 --keep"
+    until(lambda: browser.js(KEPT) == [kept], 5.0, "the row shows how to keep it")
+    assert command_line.parser().parse_args(kept.split()[1:]).keep
     for button, mode in (("deactivate", "INACTIVE"), ("activate", "READY")):
         browser.js(f"document.getElementById({button!r}).click()")
         phone.shows("mode", mode)

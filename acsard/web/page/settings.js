@@ -7,7 +7,10 @@ import { number } from "./words.js";
  *  and shows the outcome. */
 export function show(place, rows, call) {
   if (place.contains(document.activeElement) && document.activeElement.tagName === "INPUT") return;
+  const buttons = () => [...place.querySelectorAll("button")];
+  const focus = buttons().indexOf(document.activeElement);
   place.replaceChildren(...rows.map((row, n) => shown(row, `set-${n}`, call)));
+  if (focus >= 0) buttons()[focus].focus();
 }
 
 function shown({ key, value, what, when, unit = "", low, high, choices }, id, call) {
@@ -21,12 +24,19 @@ function shown({ key, value, what, when, unit = "", low, high, choices }, id, ca
   field.id = id;
   if (!choices) field.inputMode = typeof value === "number" ? "decimal" : "text";
   field.value = value;
+  const keep = made("code", "", keeping(key, field.value));
+  field.addEventListener("input", () => (keep.textContent = keeping(key, field.value)));
   const send = () => call({ settings: { [key]: read(field.value, value) } });
   field.addEventListener("keydown", (event) => event.key === "Enter" && send());
   const button = made("button", "", "Set");
   button.setAttribute("aria-label", `Set ${key}`);
   button.addEventListener("click", send);
-  return made("div", "", label, field, made("span", "quiet", unit.split(" ")[0]), button);
+  return made("div", "", label, field, made("span", "quiet", unit.split(" ")[0]), button, keep);
+}
+
+/** Return the command that keeps a value, for a terminal on the robot: the page may not write the file. */
+export function keeping(key, value) {
+  return `acsard set ${key} ${String(value).replace(",", ".")} --keep`;
 }
 
 /** Convert the typed text to the type of the present value `before`. A text that does not fit is returned unchanged,
