@@ -10,9 +10,11 @@ import faulthandler
 import os
 import shlex
 import sys
+from collections.abc import Sequence
 from contextlib import suppress
 from importlib.util import find_spec
 from pathlib import Path
+from urllib.parse import urlsplit
 
 from acsard.bus.address import address_of
 from acsard.bus.robot_discovery import ALL_ROBOTS, running_robots
@@ -41,6 +43,7 @@ acsard {version}, robot {robot}
 """
 
 _PAGE = '  page    {where}, for a browser, when "page ready" stands below\n'
+_FROM_AFAR = "          on your own computer, type `ssh -L {port}:{host}:{port} {login}` first\n"
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -99,8 +102,9 @@ def main(args: argparse.Namespace) -> int:
         if "INVOCATION_ID" not in os.environ:
             # Do not use print, because a full pipe that no program reads would block the control
             # loop.
-            shown = served is not None
-            text = banner(config, where, device, trouble, reach(args), served=shown)
+            text = banner(
+                config, where, device, trouble, reach(args), None if served is None else _login()
+            )
             screen.write(f"{text}\n")
         log.info(
             "started",
@@ -185,16 +189,32 @@ def reach(args: argparse.Namespace) -> str:
     return "".join([f" {name} {shlex.quote(value)}" for name, value in pairs if value])
 
 
+def _login() -> str:
+    # The user and the address to which this terminal is logged in, "" if it is none of SSH.
+    words = os.environ.get("SSH_CONNECTION", "").split()
+    return f"{os.environ.get('USER', 'USER')}@{words[2]}" if len(words) == 4 else ""
+
+
+def _page_lines(addresses: Sequence[str], login: str) -> str:
+    lines = _PAGE.format(where=", ".join(addresses))
+    here = next((urlsplit(text) for text in addresses if text.startswith("http://")), None)
+    if login and here is not None:
+        lines += _FROM_AFAR.format(port=here.port or 80, host=here.hostname, login=login)
+    return lines
+
+
 def banner(
     config: Config,
     where: str,
     device: str,
     trouble: str = "",
     reach: str = "",
-    *,
-    served: bool = False,
+    served: str | None = None,
 ) -> str:
-    """Return the banner of the start; `trouble` says why the device is not open yet."""
+    """Return the banner of the start; `trouble` says why the device is not open yet.
+
+    If the page is served, `served` is the login that reaches this computer, "" at its own screen.
+    """
     port = f"{device} at {config.mcu.baud_rate} baud"
     if trouble:
         port = f"none yet: {trouble}"
@@ -206,7 +226,7 @@ def banner(
         port=port,
         listen=_bus(config),
         root=ROOT_KEY,
-        page=_PAGE.format(where=", ".join(config.web.address)) if served else "",
+        page="" if served is None else _page_lines(config.web.address, served),
         where=where,
         reach=reach,
     )

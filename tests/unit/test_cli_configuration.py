@@ -229,7 +229,8 @@ def test_the_banner_has_the_approved_words(approved: Callable[[Path, str], None]
         "a simulator": run.banner(Config(), "acsard.toml", "/dev/pts/3"),
         "a robot": run.banner(real, "acsard.toml", "/dev/ttyUSB0"),
         "a board that is missing": run.banner(real, "x.toml", "/dev/ttyUSB0", "it is not there"),
-        "with the page": run.banner(served, "x.toml", "/dev/x", served=True),
+        "with the page": run.banner(served, "x.toml", "/dev/x", served=""),
+        "over ssh": run.banner(served, "x.toml", "/dev/x", served="pi@192.0.2.7"),
         "with options": run.banner(Config(), "x.toml", "/dev/x", reach=reach),
     }
     text = "".join(f"--- {what}\n{banner}" for what, banner in banners.items())
