@@ -9,13 +9,15 @@ router may not answer.
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Iterable, MutableMapping
+from collections.abc import Callable, Iterable, Mapping, MutableMapping
 from pathlib import Path
 
 from acsard.bus.tls_files import expiry_times, peer_ends_ns, unusable
+from acsard.bus.tls_trouble import RENEW_ADVICE
 from acsard.bus.zenoh_sessions import certificate_trouble
 from acsard.core.config.settings import BusConfig
-from acsard.core.values import NS_PER_S, WallNs
+from acsard.core.messages.certificate_expiry import CERTIFICATE_LEVELS, expiry
+from acsard.core.values import NS_PER_S, Event, WallNs
 from acsard.host import clock
 from acsard.host.threads import NoThreadError, in_thread
 
@@ -80,15 +82,19 @@ def router_expiry_times(routers: Iterable[str], directory: str) -> dict[str, Wal
     return {whose: ends_ns for whose, ends_ns in expiries.items() if ends_ns is not None}
 
 
-async def watch_certificates(bus: BusConfig, known: MutableMapping[str, WallNs]) -> None:
+async def watch_certificates(
+    bus: BusConfig, known: MutableMapping[str, WallNs], tell: Callable[[Event], None]
+) -> None:
     """Update the expiry times in `known` every `EXPIRY_CHECK_PERIOD_S` until cancelled.
+
+    Tells when one of them begins to be near, or is over.
 
     Its keys are those of `tls.expiry_times` and `router_expiry_times`. A value stays if a
     certificate cannot be read. With `bus.outside`, the TLS gateway reports the robot's own
     certificate.
     """
     routers = bus.tls_routers
-    answered, reading = 0, 0
+    answered, reading, said = 0, 0, ""
     while True:
         expiries: dict[str, int] = {}
         try:
@@ -104,5 +110,15 @@ async def watch_certificates(bus: BusConfig, known: MutableMapping[str, WallNs])
             # The TLS gateway reports the certificate that it uses.
             expiries.pop("", None)
         known.update(expiries)
+        said = _tell_of_change(known, said, tell)
         reading += 1
         await asyncio.sleep(EXPIRY_CHECK_PERIOD_S)
+
+
+def _tell_of_change(known: Mapping[str, WallNs], said: str, tell: Callable[[Event], None]) -> str:
+    if not known:
+        return said
+    code, text = expiry(known, clock.now().wall_ns)
+    if code != said and CERTIFICATE_LEVELS[code]:
+        tell(Event("certificate", f"{text}; {RENEW_ADVICE}", "warning", kind=code))
+    return code

@@ -18,6 +18,7 @@ from acsard.core.config.parsing import effective
 from acsard.core.config.toml_text import document
 from acsard.core.formatting import json_line, many
 from acsard.host.errors import MendableError, NotPermittedError
+from acsard.machine.certificate_findings import certificates
 from acsard.machine.deploy_files import reference, source
 
 STDOUT = 1
@@ -38,11 +39,13 @@ def main(args: argparse.Namespace) -> int:
     where, config = load(args.config)
     _require_other_output(where)
     found, bus = warnings(config) + name_warnings(config), config.bus
-    if bus.tls_routers or bus.outside:
+    if bus.uses_tls:
         try:
             require_usable(bus.tls)
         except NotPermittedError as error:
             found.append(f"the certificates were not checked: {error}")
+        else:
+            found += _about_certificates(bus.tls)
     plain = effective(config)
     if args.json:
         print(json_line(msgspec.json.encode(plain).decode()))
@@ -53,6 +56,14 @@ def main(args: argparse.Namespace) -> int:
         print(f"{where}: warning: {text}", file=sys.stderr)
     print(f"{where}: no mistakes, {many(len(found), 'warning')}", file=sys.stderr)
     return 0
+
+
+def _about_certificates(tls: str) -> list[str]:
+    # Returns warnings. Raises `MendableError` for what TLS would refuse.
+    findings = [finding for finding in certificates(tls) if finding.mend]
+    if findings and findings[0].level == "failure":
+        raise MendableError(f"{findings[0].text}; {findings[0].mend}")
+    return [f"{finding.text}; {finding.mend}" for finding in findings]
 
 
 def _write_new(file: Path) -> int:

@@ -32,12 +32,14 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 def main(args: argparse.Namespace) -> int:
     overrides = {"robot.id": args.id or None, "ros.namespace": args.namespace}
     where, config = load(args.config, overrides)
+    manager = Systemd(os.environ, os.getpid())
     if not config.bus.outside:
+        manager.ready()  # the unit takes this end for no failure, if it had started
         raise UsageError(
             f"{where} has no tls/ endpoint in bus.listen: `acsard tls init --write FILE` adds one",
         )
     log_from_environment()
-    log, manager = Log(config.log), Systemd(os.environ, os.getpid())
+    log = Log(config.log)
     try:
         holder = sys.stdin.fileno() if args.supervised else None
         return GatewayProcess(Gateway(config), log, manager, holder).run()

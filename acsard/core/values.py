@@ -246,7 +246,7 @@ EventName = Literal[
     "emergency_stop", "emergency_stop_released", "bumper_pressed", "bumper_released",
     "battery", "battery_stop",
     "gyro", "imu_refused",
-    "bus_stuck", "router_missing", "router_found", "not_a_router",
+    "bus_stuck", "router_missing", "router_found", "not_a_router", "certificate",
     "missed_periods", "recording", "latch_file",
     "gateway_open", "gateway_full", "gateway_stuck", "gateway_lost_daemon", "gateway_ended",
     "page_ended", "page_refused",

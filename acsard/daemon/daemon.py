@@ -166,7 +166,8 @@ async def run(
             keep_running(words, events.append, kind) for words, kind in served if words is not None
         ]
         if ends:
-            helpers.append(watch_certificates(config.bus, publication.report.certificate_ends))
+            known = publication.report.certificate_ends
+            helpers.append(watch_certificates(config.bus, known, events.append))
         async with _beside([port.keep_open(), _repeat_latched(bus, publication), *helpers]):
             await _control(config, control, departure, pulse, manager)
 
@@ -205,12 +206,13 @@ async def _beside(helpers: Iterable[Coroutine[Any, Any, object]]) -> AsyncIterat
 
 
 def _certificates(config: Config, ours: bool) -> dict[str, int]:
-    # By the keys of `tls.expiry_times`; {} without TLS. Raises `MendableError`. `ours`: this daemon
-    # starts the TLS gateway.
+    # By the keys of `tls.expiry_times`; {} without TLS, or if another process reads them. Raises
+    # `MendableError`. `ours`: this daemon starts the TLS gateway.
     bus = config.bus
-    if not (bus.tls_routers or (ours and bus.outside)):
+    if not bus.tls or (bus.outside and not ours and not bus.tls_routers):
         return {}
-    require_usable(bus.tls)
+    if bus.uses_tls:
+        require_usable(bus.tls)
     return expiry_times(bus.tls)
 
 

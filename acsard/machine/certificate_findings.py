@@ -65,11 +65,9 @@ def certificates(tls: str) -> Iterator[Finding]:
     expiries = expiry_times(tls)
     code, words = expiry(expiries, now().wall_ns)
     level = CERTIFICATE_LEVELS[code]
-    mend = (
-        renewal(tls, first_expiry(expiries)[0])
-        if expiries
-        else f"to install the library that reads certificates, {install()}"
-    )
+    mend = renewal(tls, first_expiry(expiries)[0]) if expiries else install()
+    if not expiries:
+        words = "nobody sees when they expire: the library that reads certificates is missing"
     yield Finding("certificates", LEVELS[level], f"{tls}: {words}", mend if level else "")
 
 

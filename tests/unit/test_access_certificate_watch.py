@@ -16,6 +16,7 @@ from acsard.bus.certificate_watch import (
 )
 from acsard.bus.tls_files import expiry_times, files_in
 from acsard.core.config.settings import BusConfig
+from acsard.core.values import Event
 from acsard.host import clock
 from acsard.machine.authority import Authority
 
@@ -88,7 +89,8 @@ async def test_new_files_and_a_new_router_are_noticed_and_missing_ones_change_no
     known = expiry_times(str(tmp_path))
     first = known[""]
     bus = BusConfig(mode="client", connect=(ROUTER,), tls=str(tmp_path))
-    task = asyncio.create_task(watch_certificates(bus, known))
+    events: list[Event] = []
+    task = asyncio.create_task(watch_certificates(bus, known, events.append))
     authority.issue(tmp_path, "robot", [], 20)
     await until(lambda: known[""] > first)
     router[0] = 7
@@ -99,4 +101,8 @@ async def test_new_files_and_a_new_router_are_noticed_and_missing_ones_change_no
     (tmp_path / "certificate.pem").unlink()
     await asyncio.sleep(0.1)
     assert known.keys() == {"", "the authority", f"the router {ROUTER}"}
+    # All of the test's certificates end within 30 days, and the router's have ended.
+    assert [event.kind for event in events] == ["expires", "expired"]
+    assert "acsard tls renew" in events[1].text
+    assert f"(certificate of the router {ROUTER})" in events[1].text
     task.cancel()

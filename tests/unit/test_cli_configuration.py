@@ -21,6 +21,7 @@ from acsard.host import config_file
 from acsard.host.config_file import SEARCH_PATHS, find
 from acsard.host.errors import CertificateError, Exit, MendableError, UsageError
 from acsard.host.version import version
+from acsard.machine.authority import Authority
 from acsard.machine.examination import OPTION_KEYS
 
 DEFAULTS = "built-in defaults"
@@ -169,6 +170,24 @@ def test_certificates_that_the_daemon_would_refuse_are_a_mistake(tmp_path: Path)
     )
     with pytest.raises(CertificateError, match="cannot read"):
         main(argparse.Namespace(config=str(file), json=False, new=None))
+
+
+def test_a_certificate_that_has_expired_is_a_mistake_and_one_that_soon_will_a_warning(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    tls, file = tmp_path / "tls", tmp_path / "robot.toml"
+    tls.mkdir()
+    file.write_text(
+        f'[bus]\nlisten = ["tls/127.0.0.1:7449", "tcp/127.0.0.1:7448"]\ntls = "{tls}"\n'
+    )
+    args = argparse.Namespace(config=str(file), json=False, new=None)
+    authority = Authority.make(tls, "test", 3650)
+    authority.issue(tls, "robot", [], 10)
+    assert main(args) == 0
+    assert "expires in 10 days; run `acsard tls renew" in capsys.readouterr().err
+    authority.issue(tls, "robot", [], -1)
+    with pytest.raises(MendableError, match=r"expired 1 days ago.*acsard tls renew"):
+        main(args)
 
 
 @pytest.mark.parametrize("sign", [">", ">>"])

@@ -225,9 +225,13 @@ def test_a_certificate_that_expires_soon_is_reported(days: int, level: int, word
     assert (state.certificate_days, row.level, row.message) == (
         days, level, state.certificate_expiry,
     )  # fmt: skip
-    unreadable, _ = state_of(config)
+    # Without a report of the gateway; a page has nobody who reports.
+    unreadable, _ = state_of(
+        replace(config, bus=BusConfig(listen=("tls/0.0.0.0:7449",), tls="/etc"))
+    )
     assert "`acsard doctor`" in unreadable.certificate_expiry
     assert unreadable.certificate_days is None
+    assert state_of(config)[0].certificate == ""
     plain, _ = state_of(CONFIG, {"": 0})
     assert (plain.certificate_expiry, plain.certificate_days) == ("", None)
 

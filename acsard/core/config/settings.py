@@ -398,6 +398,11 @@ class BusConfig(Struct, frozen=True):
         return tuple(e for e in self.connect if is_tls(e))
 
     @property
+    def uses_tls(self) -> bool:
+        """Whether the bus uses the certificates in `tls`; else only the page may."""
+        return bool(self.tls_routers or self.outside)
+
+    @property
     def listening(self) -> tuple[str, ...]:
         """The endpoints at which the daemon or its gateway listens: none if `mode` is "client"."""
         return self.listen if self.mode == "peer" else ()

@@ -336,7 +336,8 @@ class Report:
         )
 
     def _certificate(self, now: Instant) -> tuple[str, str]:
-        if not self._config.bus.tls:
+        bus = self._config.bus
+        if not bus.tls or not (self.certificate_ends or bus.uses_tls):
             return "", ""
         return expiry(self.certificate_ends, now.wall_ns)
 
