@@ -17,6 +17,7 @@ from tests.system.harness import PATIENCE_S, until
 from tests.system.hosts import inside
 from tests.systemd.container import (
     CONFIG,
+    GATEWAY,
     PAGE,
     UNIT,
     Container,
@@ -154,6 +155,25 @@ def test_an_invited_phone_drives_and_stops_the_installed_robot_until_it_is_revok
         "the robot stands",
     )
     assert stands["mode"] != "stopped", "no client has stopped it: the driver is gone"
+
+
+def test_a_page_for_phones_leaves_no_failed_unit_and_no_warning(
+    robot: Container, phone: Phone
+) -> None:
+    """The certificates are for the page alone: the bus listens nowhere with TLS."""
+    robot.run("systemctl", "restart", UNIT, GATEWAY)
+    until(lambda: robot.show("ActiveState", GATEWAY) != "activating", SERVED_S, "it has started")
+    assert (robot.show("ActiveState", GATEWAY), robot.show("Result", GATEWAY)) == (
+        "inactive", "success",
+    )  # fmt: skip
+    assert "has no tls/ endpoint" in robot.messages(GATEWAY)
+    is_served(robot, phone)
+    state = until(
+        lambda: (state := json.loads(robot.fetch("/api/state")))["certificate"] and state,
+        SERVED_S,
+        "the daemon reads the certificates",
+    )
+    assert state["certificate"] == "valid"
 
 
 def test_a_client_without_a_token_gets_only_the_empty_page(robot: Container, phone: Phone) -> None:
