@@ -57,12 +57,18 @@ class Running(Struct, frozen=True):
     """The answers of a running daemon."""
 
     info: Info
-    config: Config
+    config: Config | None  # the daemon's, if known
     rows: tuple[DiagnosticStatus, ...]
     role: str  # this client's role, certificate and name at the daemon
     is_local: bool = True  # it runs on this machine
     ahead_s: Seconds = 0.0  # its clock
     round_trip_s: Seconds = 0.0  # of the query of its clock
+
+
+NOT_READ = (
+    "this role may not read the daemon's configuration, and the file is of another robot: the "
+    "daemon's port and files were not examined"
+)
 
 
 def examine(
@@ -105,7 +111,10 @@ def _findings(
     yield Finding("role", "ok", running.role)
     yield from reported(running.rows)
     if running.is_local:
-        yield from compared(running, config)
+        if running.config is None:
+            yield Finding("configuration", "ok", NOT_READ)
+            return
+        yield from compared(running.config, config)
         yield from local(running.config, address, config.bus.tls, running.info.pid)
     else:
         text_ = "the daemon runs on another machine: check its port, files and TLS gateway there"
@@ -185,7 +194,8 @@ def query_or_finding(config: Config, address: Address) -> Running | Finding:
 def query(config: Config, address: Address) -> Running:
     """Query the daemon. Raises an `AcsardError` without an answer.
 
-    The local `config`, with the values of `info`, stands in for one that is not returned.
+    The local `config`, with the values of `info`, stands in for one that is not returned, if both
+    are of the same robot.
     """
     with open_connection(address) as robot:
         info = robot.get("info")
@@ -198,32 +208,38 @@ def query(config: Config, address: Address) -> Running:
         return Running(info, runs, rows, role, is_daemon_here(info.pid), ahead_s, trip_s)
 
 
-def _configuration(robot: Connection, info: Info, file: Config) -> Config:
-    # Otherwise `file`, with the values of `info`.
+def _configuration(robot: Connection, info: Info, file: Config) -> Config | None:
+    # Otherwise `file` with the values of `info`, if it is this robot's.
     try:
         return from_builtins(robot.get("config"))
     except (AcsardError, msgspec.ValidationError):  # not permitted, or a daemon of another version
+        if file.robot.id != info.id:
+            return None
         mcu = replace(file.mcu, port=SIMULATOR if info.simulated else info.port)
         bus = replace(file.bus, listen=tuple(info.listen), connect=tuple(info.connect))
         return replace(file, robot=replace(file.robot, id=info.id), mcu=mcu, bus=bus)
 
 
-def compared(running: Running, file: Config) -> Iterator[Finding]:
+def compared(running: Config, file: Config) -> Iterator[Finding]:
     """Yield a finding about the values of the daemon that differ from those of the file."""
-    runs, ours = running.config.robot.id, file.robot.id
+    runs, ours = running.robot.id, file.robot.id
     if runs != ours:
         text = f"the file is not compared with the daemon: it is for robot {ours}, not for {runs}"
         yield Finding("configuration", "ok", text)
         return
-    others = differences(running.config, file)
+    others = differences(running, file)
     if not others:
         yield Finding("configuration", "ok", "the running daemon uses the file's values")
         return
     texts = [difference.describe(key) for key, difference in others.items()]
+    text = f"the running daemon has other values than the file: {listed(texts, MAX_KEYS, '; ')}"
+    if others.keys() <= set(OPTION_KEYS):
+        yield Finding("configuration", "ok", f"{text}; they come from its options")
+        return
     yield Finding(
         "configuration",
-        "ok" if others.keys() <= set(OPTION_KEYS) else "warning",
-        f"the running daemon has other values than the file: {listed(texts, MAX_KEYS, '; ')}",
+        "warning",
+        text,
         "they come from options of `acsard run`, from `acsard set`, from another file (name it "
         "with --config), or the file has changed since the daemon's start: restart the daemon with "
         "this file, or write the values into it",

@@ -57,6 +57,9 @@ def unused_version() -> Iterator[Finding]:
     """Yield a finding about an installed version that the service does not run."""
     if newer := versions.unused():
         text = f"{newer} is installed, but not in use; the service runs {versions.current()}"
+        if newer == versions.previous():  # somebody went back, perhaps from a bad version
+            yield Finding("version", "ok", f"{text}, after {newer} was in use")
+            return
         mend = f"`sudo acsard service upgrade {versions.HOME / newer}` changes to it"
         yield Finding("version", "warning", text, mend)
 

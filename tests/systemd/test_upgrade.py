@@ -180,7 +180,7 @@ def test_an_upgrade_runs_the_new_version_and_a_rollback_the_old_one_with_the_sto
     assert (robot.readlink(), robot.readlink("previous")) == (robot.old, NEW)
     assert robot.runs() == robot.old
     assert (robot.latch(), robot.kept(), robot.moved(began)) == (number, kept, [])
-    # The doctor tells the operator that the new version is still there.
+    # The doctor says that the new version is still there, and does not advise it.
     found = robot.types("doctor", "--config", CONFIG).out
     assert f"{NEW} is installed, but not in use; the service runs {robot.old}" in found
 

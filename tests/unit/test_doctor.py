@@ -57,14 +57,14 @@ def test_each_remedy_is_said_once() -> None:
 
 
 def test_the_file_s_values_are_ok() -> None:
-    assert [finding.level for finding in compared(running(), FILE)] == ["ok"]
+    assert [finding.level for finding in compared(FILE, FILE)] == ["ok"]
 
 
 def test_values_of_command_line_options_are_no_warning() -> None:
     bus = BusConfig(listen=("tcp/127.0.0.1:1", "tcp/127.0.0.1:2"))
     runs = replace(FILE, mcu=McuConfig(port="/dev/pts/3"), bus=bus)
-    (finding,) = compared(running(runs), FILE)
-    assert finding.level == "ok"
+    (finding,) = compared(runs, FILE)
+    assert (finding.level, finding.mend) == ("ok", "")
     assert "mcu.port = " in finding.text
 
 
@@ -88,15 +88,34 @@ def test_a_router_without_tls_is_warned_of_unless_only_this_machine_reaches_it(
 
 def test_the_file_of_another_robot_is_not_compared() -> None:
     runs = replace(FILE, robot=replace(FILE.robot, id="robot1"))
-    (finding,) = compared(running(runs), FILE)
+    (finding,) = compared(runs, FILE)
     assert (finding.level, finding.mend) == ("ok", "")
     assert "it is for robot " in finding.text
+
+
+class OfAnotherRobot:
+    """A connection whose role may not read the configuration."""
+
+    def get(self, key: str) -> object:
+        raise NoAnswerError(key)
+
+
+@pytest.mark.parametrize(("robot", "judged"), [("acsar", True), ("robot1", False)])
+def test_a_robot_is_judged_by_its_own_file_only(
+    robot: str, judged: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    info = replace(INFO, id=robot)
+    config = examination._configuration(OfAnotherRobot(), info, FILE)  # type: ignore[arg-type]
+    monkeypatch.setattr(examination, "query_or_finding", lambda *_: Running(info, config, (), ""))
+    found = list(examine("x", b"", {}))
+    assert ("port" in {finding.subject for finding in found}) is judged
+    assert any("file is of another robot" in finding.text for finding in found) is not judged
 
 
 def test_values_that_were_set_and_sources_that_only_the_file_has_are_a_warning() -> None:
     limits = replace(FILE.limits, linear_speed=0.4)
     commands = replace(FILE.commands, sources=FILE.commands.sources[1:])
-    (finding,) = compared(running(replace(FILE, limits=limits, commands=commands)), FILE)
+    (finding,) = compared(replace(FILE, limits=limits, commands=commands), FILE)
     assert finding.level == "warning"
     assert "limits.linear_speed = 0.4, not " in finding.text
     assert f"commands.sources.{FILE.commands.sources[0].name}.priority" in finding.text
@@ -214,6 +233,9 @@ def test_a_newer_version_that_is_not_in_use_is_a_warning_with_the_command(
     (finding,) = unused_version()
     assert finding.level == "warning"
     assert "`sudo acsard service upgrade /opt/acsard/0.3.0`" in finding.mend
+    monkeypatch.setattr(versions, "previous", lambda: "0.3.0")
+    (finding,) = unused_version()
+    assert (finding.level, finding.mend) == ("ok", ""), "the operator has left this version"
 
 
 RULES = Path(__file__).parents[2] / "deploy" / "udev" / "70-acsar.rules"
