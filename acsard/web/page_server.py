@@ -77,7 +77,8 @@ async def serve(
         require_certificate(options.listen, options.tls)
         certificate = Certificate(options.tls, log)
     names = set[str]() if certificate is None else certificate.names
-    about = About.of("", options.config.mcu.simulated, options.config)
+    # People may stand in the way of a simulated robot, so only the daemon says that it is one.
+    about = About.of("", simulated=False, config=options.config)
     robot = FollowedRobot(options.address, lambda: _connected(options.address), about, counts)
     parts = Parts(robot, counts)
     tokens = ReadTokens(Vault(options.state, options.address.robot_id))

@@ -20,6 +20,7 @@ from typing import Any
 import aiohttp
 import pytest
 
+from acsard.core.config.parsing import parse
 from acsard.recording.file import MAGIC
 from acsard.web.openapi import KEYS
 from tests.system.browser import Page, answer, hands, text
@@ -45,6 +46,18 @@ from tests.unit import page_schemas
 @pytest.fixture
 def bus(standing: Bus) -> Bus:
     return standing
+
+
+async def test_a_page_that_has_not_heard_the_robot_does_not_call_it_simulated(
+    tmp_path: Path,
+) -> None:
+    """The file's port is the simulator, but no daemon runs: people may stand in the way."""
+    nobody = Daemon(tmp_path)
+    assert parse(nobody.config.read_bytes()).mcu.simulated
+    with Page(nobody, tmp_path) as page:
+        async with hands(page) as ours:
+            greeting = (await ours.find(lambda message: "hello" in message))["hello"]
+    assert greeting["simulated"] is False
 
 
 @pytest.mark.network
