@@ -123,6 +123,7 @@ def _add_state(metrics: Metrics, state: RobotState) -> None:
     latencies = {
         (name, at): getattr(latency.last_minute, at) * 1e-6
         for name, latency in state.latencies.items()
+        if latency.last_minute.count  # else nothing was measured
         for at in ("p50", "p99", "max")
     }
     what = "latencies of the daemon, over the last minute"

@@ -14,7 +14,10 @@ SPREAD = Spread(10, 5.0, 20.0, 80.0)
 STATE = RobotState(
     Time(1, 0), "driving", "commanded by app", 1.0, 2.0, 0.5, 0.25, -0.5,
     [1.0, 2.0, 3.0, 4.0], "up", "app", [], "", {"lines": 7, "missed_periods": 2},
-    latencies={"period_lateness": Latency(SPREAD, SPREAD)},
+    latencies={
+        "period_lateness": Latency(SPREAD, SPREAD),
+        "mcu_round_trip": Latency(SPREAD, Spread(0, 0.0, 0.0, 0.0)),
+    },
 )  # fmt: skip
 
 
@@ -46,6 +49,7 @@ def test_the_state_of_the_robot_becomes_samples_with_labels() -> None:
     assert samples["acsard_robot_total", frozenset({own, ("what", "missed_periods")})] == 2
     late = frozenset({own, ("latency", "period_lateness"), ("at", "p99")})
     assert abs(samples["acsard_latency_seconds", late] - 20e-6) < 1e-12
+    assert not [labels for _, labels in samples if ("latency", "mcu_round_trip") in labels]
     assert samples["acsard_page_viewers", frozenset({own})] == 3
     assert samples["acsard_page_total", frozenset({own, ("what", "commands")})] == 4
     assert samples["acsard_page_refused_total", frozenset({own, ("reason", "host")})] == 5
