@@ -6,10 +6,14 @@ import re
 import runpy
 from contextlib import redirect_stdout
 from io import StringIO
+from typing import get_args
 from zipfile import ZipFile
 
 import pytest
 
+from acsard.core.codes import CODES
+from acsard.core.messages.schema import RobotState
+from acsard.core.values import EventName
 from acsard.web import manual
 from tests.each import each
 from tests.pages import MANUAL, ROOT, prose, text_of
@@ -39,6 +43,8 @@ QUESTIONS = {
     "How do I stop all robots?": ("howto/fleet-all.md", "acsard call stop --id"),
     "How do I let a laptop in?": ("howto/access.md", "tls init"),
     "Which role may clear a stop?": ("reference/keys.md", "| operator | all of viewer"),
+    "Why does the odometry drift?": ("howto/trouble.md", "Calibrate"),
+    "Why may I not open ttyUSB0?": ("howto/trouble.md", "usermod -aG dialout"),
     "How do I change a setting for good?": ("howto/service.md", "--keep"),
 }
 
@@ -73,6 +79,16 @@ def test_home_answers_a_question_within_two_clicks(question: str) -> None:
     first = links(HOME)
     assert page in first.union(*map(links, first))
     assert answer in text_of(f"deploy/manual/pages/{page}")
+
+
+def test_each_name_on_the_page_of_troubles_is_one_of_the_product() -> None:
+    """A code, an event, a counter, a field of `state`, a setting or an option."""
+    text = text_of("deploy/manual/pages/howto/trouble.md")
+    named = set(re.findall(r"`([a-z]+(?:_[a-z]+)+)`", text))
+    assert len(named) > 10
+    known = set(CODES) | {*get_args(EventName)} | set(RobotState.__struct_fields__)
+    counters = text_of("deploy/manual/pages/reference/counters.md")
+    assert not {name for name in named - known if f"`{name}`" not in counters}
 
 
 def test_the_page_of_the_counters_has_each_name_that_the_product_counts() -> None:
