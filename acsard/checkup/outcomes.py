@@ -25,8 +25,8 @@ FAIL baud rate: received_nothing | nothing received
     `{example}` (the letters are those of mcu.wheels), are TX and RX swapped?
 FAIL baud rate: received_text | text instead of replies
     at {configured} baud {heard}; no good line at any other rate
-    -> the baud rate is right, but the firmware prints other text: remove its Serial.print, and let
-    it answer each line
+    -> the baud rate is right. Is this the board (`acsard ports`)? Then its firmware prints other
+    text: remove its Serial.print, and let it answer each line
 FAIL baud rate: received_form | replies in another form
     at {configured} baud {heard}; no good line at any other rate
     -> the lines are whole, but the firmware must send `{example}`: p or n as the sign, and two
@@ -48,6 +48,15 @@ FAIL baud rate: received_garbage | only garbage
     at {configured} baud {heard}; no good line at any other rate
     -> does the firmware send at 9600 to 500000 baud, at TTL level and not RS-232? is this the right
     port (`acsard ports`), and is the board's ground connected to the computer's?
+FAIL baud rate: received_brownout | the board starts again and again
+    at {configured} baud {heard}: its supply voltage is too low
+    -> give the board a supply of its own or a thicker cable: starting motors pull down the voltage
+FAIL baud rate: received_boot | the board starts again and again
+    at {configured} baud {heard}
+    -> does its supply break down, or does an error in its firmware restart it?
+FAIL baud rate: received_nmea | another device
+    at {configured} baud {heard}: this is what a GPS receiver sends
+    -> name the port of the board: `acsard ports` lists all
 FAIL baud rate: received_few | few good lines
     at {configured} baud {heard}; fewer good lines at any other rate
     -> use a short cable away from the motors' leads, a common ground, or a lower baud rate at both

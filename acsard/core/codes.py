@@ -33,8 +33,8 @@ LinkCode = Literal[
     "link_silent", "host_late", "simulator_fault", "echo", "set_points", "no_checksum",
     "replies_damaged", "lines_too_rare", "reply_period", "received_nothing", "received_statuses",
     "received_text", "received_form", "received_letters", "received_cut", "received_foreign",
-    "received_garbage",
-    "received_few", "received_sparse",
+    "received_garbage", "received_few", "received_sparse", "received_brownout", "received_boot",
+    "received_nmea",
 ]  # fmt: skip
 
 # Why the pose may be far off although the link is up.
@@ -322,8 +322,9 @@ received_statuses
     -> is TX of this computer connected to RX of the board? `acsard mcu check` finds out more
 received_text
     no link to the microcontroller: {received};
-    -> the firmware prints other text: remove its Serial.print or debug output, and let it send
-    replies such as `ap00.00,bp00.00,cp00.00,dp00.00`, with the letters of mcu.wheels
+    -> is mcu.port the port of the board (`acsard ports`)? Then its firmware prints other text:
+    remove its Serial.print or debug output, and let it send replies such as
+    `ap00.00,bp00.00,cp00.00,dp00.00`, with the letters of mcu.wheels
 received_form
     no link to the microcontroller: {received};
     -> the lines are whole, but in another form: the firmware must send
@@ -342,7 +343,17 @@ received_foreign
     check` finds out more
 received_garbage
     no link to the microcontroller: {received};
-    -> is mcu.baud_rate the baud rate of the board? `acsard mcu check` finds out more
+    -> is mcu.baud_rate the baud rate of the board, and mcu.port its port (`acsard ports`)? `acsard
+    mcu check` finds out more
+received_brownout
+    the microcontroller starts again and again, because its supply voltage is too low: {received};
+    -> give the board a supply of its own or a thicker cable: starting motors pull down the voltage
+received_boot
+    the microcontroller starts again and again: {received};
+    -> does its supply break down when motors start, or does an error in its firmware restart it?
+received_nmea
+    no link to the microcontroller: {received}; this is what a GPS receiver sends;
+    -> write the port of the board into mcu.port: `acsard ports` lists all
 received_few
     no link to the microcontroller: {received};
     -> check the cable, the ground and the baud rate; `acsard mcu check` finds out more

@@ -16,6 +16,7 @@ from acsard.core.config.settings import (
     WheelMap,
 )
 from acsard.core.simulator.fake_mcu import FakeMcu
+from acsard.core.values import Received
 from tests.each import each
 from tests.scenarios.world import World
 from tests.wheels import FOUR, TWO
@@ -155,6 +156,26 @@ def test_a_torn_line_moves_nothing_and_spoils_no_later_line(world: World) -> Non
     assert world.mcu.valid_lines == valid + len(behind)
     assert world.mcu.vehicle.set_points == [10.0] * 4
     assert world.state.counters["lines_superseded"] == 1
+
+
+BOOT_TEXT = (
+    b"\r\nBrownout detector was triggered\r\n\r\nets Jul 29 2019 12:21:46\r\n\r\n"
+    b"rst:0xf (RTCWDT_BROWN_OUT_RESET),boot:0x13 (SPI_FAST_FLASH_BOOT)\r\nentry 0x400805e4\r\n"
+)
+
+
+def test_a_board_that_prints_its_boot_text_has_restarted_and_says_why(world: World) -> None:
+    """It starts in 0.4 s: as a silence alone, that would only ramp down and up."""
+    world.drive(0.5, seconds=1.0)
+    for _ in range(2):
+        world.port.feed(Received(world.instant, BOOT_TEXT))
+        with world.mcu.fault("mute"):
+            world.hold(0.5, seconds=0.4)
+        world.hold(0.5, seconds=1.0)
+    told = [event.text for event in world.events if event.name == "mcu_restarted"]
+    cause = "because its supply voltage was too low: it sent `Brownout detector was triggered`"
+    assert told == [f"the microcontroller has restarted {cause}"] * 2
+    assert world.state.linear == 0.0, "each sender must be neutral again"
 
 
 def test_a_slow_wire_drives_at_the_rate_it_carries() -> None:

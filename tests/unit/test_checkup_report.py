@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from typing import Any
+from typing import Any, get_args
 
 import pytest
 
@@ -14,6 +14,7 @@ from acsard.checkup.motion import MAX_WATCHDOG_S
 from acsard.checkup.outcomes import OUTCOMES, OUTCOMES_BY_NAME, find
 from acsard.core.config.contradictions import contradictions
 from acsard.core.config.settings import Config, McuConfig, WheelMap
+from acsard.core.link.link_diagnosis import ReceivedCode
 from acsard.core.link.link_state import WATCHDOG_S
 from tests.each import each
 from tests.unit.checkup_robots import configured
@@ -103,6 +104,11 @@ class AnyObservation(float):
 
 SEEN = {part.partition("}")[0].partition(":")[0].partition("!")[0]
         for part in OUTCOMES.split("{")[1:]}  # fmt: skip
+
+
+@each("code", get_args(ReceivedCode))
+def test_the_check_has_a_row_for_each_code_of_received_bytes(code: str) -> None:
+    assert f"baud rate: {code}" in OUTCOMES_BY_NAME
 
 
 @each("outcome", OUTCOMES_BY_NAME)

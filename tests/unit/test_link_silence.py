@@ -59,6 +59,18 @@ HEARD: dict[str, tuple[bytes, str, str]] = {
     "a wrong check": (b"ap00.00,bp00.00,cp00.00,dp00.00#07*0000\r\n", "foreign", "none good"),
     "two motors": (b"lp00.00,rp00.00\r\n", "letters", "the last one is `lp00.00,rp00.00`"),
     "two motors, with checks": (b"lp00.00,rp00.00#07*585F\r\n", "letters", "none good"),
+    "a boot": (
+        b"ets Jul 29 2019 12:21:46\r\n\r\nrst:0x1 (POWERON_RESET),boot:0x13\r\n"
+        b"load:0x3fff0030,len:1184\r\n", "boot", "the last one is `load:0x3fff0030,len:1184`"
+    ),
+    "a low supply": (
+        b"Brownout detector was triggered\r\n\r\nrst:0xf (RTCWDT_BROWN_OUT_RESET)\r\n"
+        b"entry 0x400805e4\r\n", "brownout", "none good"
+    ),
+    "a GPS receiver": (
+        b"$GPGGA,123519.00,4807.038,N,01131.000,E,1,08,0.9,545.4,M,46.9,M,,*47\r\n", "nmea",
+        "1 line received, none good"
+    ),
     "some good": (
         STOP + b"ap?\r\n", "few", "2 lines received, only 1 good, the last bad one is `ap?`"
     ),

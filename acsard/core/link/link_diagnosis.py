@@ -39,7 +39,15 @@ MAX_SHOWN_BYTES = 64  # a complete line and some noise
 ReceivedCode = Literal[
     "received_nothing", "received_statuses", "received_text", "received_form", "received_letters",
     "received_cut", "received_foreign", "received_garbage", "received_few", "received_sparse",
+    "received_brownout", "received_boot", "received_nmea",
 ]  # fmt: skip
+
+# Text that names its sender, or what happened to it. Noise does not make it.
+_NAMED: dict[ReceivedCode, re.Pattern[bytes]] = {
+    "received_brownout": re.compile(rb"Brownout detector|BROWN_?OUT"),
+    "received_boot": re.compile(rb"rst:0x[0-9a-f]|ESP-ROM:|^ets [A-Z][a-z]{2} "),
+    "received_nmea": re.compile(rb"^\$[A-Z]{5},.*\*[0-9A-F]{2}$"),
+}
 
 CHECKED_FIRMWARE = ', does its firmware support mcu.link_check = "on" (else write "off")'
 
@@ -76,6 +84,11 @@ def is_text(line: bytes) -> bool:
     )
 
 
+def named(line: bytes) -> ReceivedCode | None:
+    """Return what a bad line says of its sender, if it says anything."""
+    return next((code for code, text in _NAMED.items() if text.search(line)), None)
+
+
 PORT_BLOCKED = sentence("port_blocked")
 
 WINDOW_LINES = 1000  # sent lines whose answers are counted: 10 s at 100 Hz
@@ -91,6 +104,7 @@ class Traffic(Struct):
     good: int = 0
     statuses: int = 0
     texts: int = 0  # bad lines for which `is_text` holds
+    named: ReceivedCode | None = None  # by bad lines; that of a low supply stays
     formed: int = 0  # bad lines that are replies in another form
     lettered: int = 0  # bad lines that are replies of other motors
     motors: str = ""  # letters of the last such line, sorted
@@ -111,6 +125,8 @@ class Traffic(Struct):
         if not good:
             self.last, self.within = line, bool(_RIGHT[len(letters)].search(line))
             self.texts += is_text(line)
+            if self.named != "received_brownout":
+                self.named = named(line) or self.named
             if whole := _WHOLE.fullmatch(line):
                 motors = b"".join(sorted(_MOTOR.findall(whole[1]))).decode()
                 if motors != letters:
@@ -124,6 +140,8 @@ class Traffic(Struct):
             return "received_statuses"
         if not self.size:
             return "received_nothing"
+        if self.named:
+            return self.named
         bad = self.lines - self.good
         if 2 * self.texts > bad:
             return "received_text"

@@ -12,6 +12,7 @@ from typing import Literal
 from msgspec import Struct, field
 
 from acsard.core.codes import Reason, sentence
+from acsard.core.formatting import printable_bytes
 from acsard.core.link import link_diagnosis
 from acsard.core.link.board_status import STATUS, StatusReports
 from acsard.core.link.checked_line import Reading, seal, unseal
@@ -49,6 +50,12 @@ NAMES: dict[LinkState, EventName] = {
 LONG_GAP_NS = 1 * NS_PER_S
 
 IDENTITY = b"!acsard-mcu "  # acsard's firmware, after booting and as the answer to `QUESTION`
+
+# Boot texts that say that the board has restarted, and why.
+RESTARTS: dict[str | None, str] = {
+    "received_brownout": " because its supply voltage was too low",
+    "received_boot": "",
+}
 
 REMARKS = (b"!", QUESTION)  # begin of lines that are no reply
 
@@ -413,7 +420,7 @@ class McuSession(Struct):
             else:
                 speeds = setup.codec.decode(line)
         except FrameError as error:
-            self._refuse(setup, line, error)
+            self._refuse(setup, out, line, error)
             return None
         self._echo.measured(speeds, out.set_points, setup.command_interval_ns / NS_PER_S)
         self.good_lines += 1
@@ -431,7 +438,10 @@ class McuSession(Struct):
             self._check_samples(out, reading)
         return placed
 
-    def _refuse(self, setup: LinkSetup, line: bytes, error: FrameError) -> None:
+    def _refuse(self, setup: LinkSetup, out: Output, line: bytes, error: FrameError) -> None:
+        if (code := link_diagnosis.named(line)) in RESTARTS:
+            text = printable_bytes(line, link_diagnosis.MAX_SHOWN_BYTES)
+            self._restart(out, f"has restarted{RESTARTS[code]}: it sent `{text}`")
         if error.reason == "repeated":
             self.rejects["repeated"] = self.rejects.get("repeated", 0) + 1
         elif (
