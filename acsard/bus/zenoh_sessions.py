@@ -6,9 +6,11 @@ they need: `acsard call stop` starts in half of the time without those of the da
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import re
+import time
 from pathlib import Path
 
 import zenoh
@@ -17,6 +19,7 @@ from acsard.bus.tls_files import CA, CERTIFICATE, KEY, files_in, host_and_port, 
 from acsard.bus.tls_trouble import RENEW_ADVICE, trouble
 from acsard.core.config.settings import TLS_PREFIX, Config, is_tls
 from acsard.core.messages.keys_and_roles import IMU, SPEED_LIMIT, full_key, source_keys
+from acsard.host import clock
 from acsard.host.errors import (
     CertificateError,
     InUseError,
@@ -30,6 +33,10 @@ from acsard.host.errors import (
 COMMAND_RATE_HZ = 1000.0
 
 MAX_SESSIONS = 256  # connections
+
+# For an address of this computer that DHCP may bring later. A service that failed at once would use
+# up its restarts.
+ADDRESS_WAIT_S, ADDRESS_RETRY_S = 8.0, 0.5
 
 MAX_MESSAGE_BYTES = 65536  # commands have a far lower limit
 
@@ -197,17 +204,30 @@ def _listening() -> dict[str, object]:
 
 
 def _opened(settings: dict[str, object], where: tuple[str, ...]) -> zenoh.Session:
-    try:
-        return zenoh.open(_config(settings))
-    except zenoh.ZError as error:
-        reason = first_line(error)
-        if number := re.search(r"\(os error (\d+)\)", reason):
-            reason = os.strerror(int(number[1]))
-        raise InUseError(
-            f"cannot listen on {', '.join(where)}: {reason}; if another daemon or "
-            "router uses the address, stop that program, or choose another address with --listen "
-            "or in bus.listen",
-        ) from error
+    until_s = clock.steady_s() + ADDRESS_WAIT_S
+    while True:
+        try:
+            return zenoh.open(_config(settings))
+        except zenoh.ZError as error:
+            reason = first_line(error)
+            number = re.search(r"\(os error (\d+)\)", reason)
+            code = int(number[1]) if number else 0
+            if code != errno.EADDRNOTAVAIL:
+                advice = (
+                    "if another daemon or router uses the address, stop that program, or choose "
+                    "another address with --listen or in bus.listen"
+                )
+            elif clock.steady_s() < until_s:
+                time.sleep(ADDRESS_RETRY_S)
+                continue
+            else:
+                advice = (
+                    "this computer does not have one of these addresses (`hostname -I` prints its "
+                    "own): connect its network, or correct bus.listen"
+                )
+            reason = os.strerror(code) if code else reason
+            text = f"cannot listen on {', '.join(where)}: {reason}; {advice}"
+            raise InUseError(text) from error
 
 
 def client_session(endpoint: str, tls: str = "") -> zenoh.Session:

@@ -7,6 +7,7 @@ import os
 import pwd
 import stat
 from collections.abc import Sequence
+from pathlib import Path
 
 from acsard.host.processes import Holder, is_pty, masters_of
 
@@ -87,3 +88,18 @@ def _is_member(group: str) -> bool:
         return pwd.getpwuid(os.getuid()).pw_name in members
     except KeyError:
         return False
+
+
+WITHOUT_DEVICE = (
+    "is there, but no device is behind it: was it plugged in again? A container keeps the file of "
+    "the old one: pass /dev/serial/by-id into it, or restart it"
+)
+
+
+def is_orphan(path: str) -> bool:
+    """Whether a character device has no device. Opening a port would restart an Arduino."""
+    number = os.stat(path).st_rdev
+    place = Path("/sys/dev/char")
+    if is_pty(path) or not place.is_dir():  # a pty has no entry
+        return False
+    return not (place / f"{os.major(number)}:{os.minor(number)}").exists()

@@ -13,7 +13,7 @@ from acsard.core.messages.diagnostics import SIMULATOR_ADVICE
 from acsard.core.values import NS_PER_S, Ns
 from acsard.host import clock, real_time
 from acsard.host.kernel_counters import Kernel, Reading
-from acsard.host.port_access import advice_about, denial
+from acsard.host.port_access import WITHOUT_DEVICE, advice_about, denial, is_orphan
 from acsard.host.processes import holders, is_running
 from acsard.machine import versions
 from acsard.machine.finding import Finding, Level
@@ -169,6 +169,10 @@ def serial_port(path: str, simulated: bool) -> Iterator[Finding]:
     if not stat.S_ISCHR(os.stat(path).st_mode):
         mend = "`acsard ports` lists the serial devices: write one of them as mcu.port"
         yield Finding("port", "failure", f"{path} is not a serial device", mend)
+        return
+    if is_orphan(path):
+        mend = "`acsard ports` lists the serial devices"
+        yield Finding("port", "failure", f"{path} {WITHOUT_DEVICE}", mend)
         return
     yield _permission(path)
     for holder in holders(path):

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 
+from acsard.bus import zenoh_sessions
 from acsard.bus.address import Address, address_by_environment
 from acsard.bus.robot_discovery import (
     MAX_NAMED,
@@ -86,6 +87,19 @@ def test_a_client_without_a_session_names_its_router_and_no_address_to_listen_on
     assert text.startswith("cannot open the Zenoh session to nonsense: ")
     assert text.endswith("; check bus.connect, then start acsard again")
     assert "listen" not in text
+
+
+def test_an_address_that_this_computer_does_not_have_is_waited_for_and_named(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """DHCP may bring it later; 192.0.2.7 is nobody's."""
+    waits: list[float] = []
+    monkeypatch.setattr("time.sleep", waits.append)
+    monkeypatch.setattr(zenoh_sessions, "ADDRESS_WAIT_S", 0.3)
+    bus = BusConfig(listen=("tcp/192.0.2.7:7448",), insecure=True)
+    with pytest.raises(InUseError, match="this computer does not have one of these addresses"):
+        daemon_session(Config(bus=bus))
+    assert set(waits) == {zenoh_sessions.ADDRESS_RETRY_S}
 
 
 # several robots

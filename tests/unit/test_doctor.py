@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import pty
 import re
 import resource
 import socket
+import stat
 import subprocess
 import sys
 from pathlib import Path
@@ -18,9 +20,11 @@ from acsard.bus.address import Address
 from acsard.core.config.settings import BusConfig, Config, McuConfig
 from acsard.core.messages.encodings import DecodeError
 from acsard.core.messages.schema import DiagnosticStatus, Info, KeyValue
+from acsard.daemon.serial.device import refusal
 from acsard.host import real_time
 from acsard.host.errors import CertificateError, NoAnswerError
 from acsard.host.kernel_counters import Kernel
+from acsard.host.port_access import WITHOUT_DEVICE
 from acsard.machine import examination, versions
 from acsard.machine.examination import Running, clocks, compared, examine, reported, routers
 from acsard.machine.finding import Finding
@@ -188,6 +192,16 @@ def test_the_scheduling_policy_of_a_running_daemon_is_reported(
 
 
 # A person's own simulator of their board often keeps both ends of its pty open.
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="needs root, to make a device file")
+def test_a_device_file_without_a_device_is_named_by_doctor_and_daemon(tmp_path: Path) -> None:
+    path = str(tmp_path / "ttyUSB0")
+    os.mknod(path, 0o660 | stat.S_IFCHR, os.makedev(188, 199))
+    (finding,) = serial_port(path, simulated=False)
+    assert (finding.level, finding.text) == ("failure", f"{path} {WITHOUT_DEVICE}")
+    assert WITHOUT_DEVICE in str(refusal(path, OSError(errno.ENXIO, "no such device")))
+    assert next(serial_port("/dev/null", simulated=False)).level == "ok"
 
 
 def test_a_program_that_uses_the_port_in_place_of_the_daemon_is_a_failure() -> None:
