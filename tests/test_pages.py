@@ -147,9 +147,6 @@ def test_the_subscribers_of_other_languages_are_those_that_are_run() -> None:
 
 # links and files
 
-# The manual links to files of the repository by their address, because it is read without them.
-FORGE = "https://github.com/acsard/acsard/blob/HEAD/"
-
 
 def anchors(text: str) -> set[str]:
     """Return the link targets of headings as a code forge makes them: lower case, - for spaces."""
@@ -160,11 +157,10 @@ def anchors(text: str) -> set[str]:
 @each("page", [*PAGES, "CHANGELOG.md", "SECURITY.md"])
 def test_every_link_leads_somewhere(page: str) -> None:
     for target in re.findall(r"\]\(([^)\s]+)\)", prose(page)):
-        if "://" in target and not target.startswith(FORGE):
+        if "://" in target:
             continue
-        name, _, anchor = target.removeprefix(FORGE).partition("#")
-        place = ROOT if target.startswith(FORGE) else (ROOT / page).parent
-        path = place / name if name else ROOT / page
+        name, _, anchor = target.partition("#")
+        path = (ROOT / page).parent / name if name else ROOT / page
         assert path.exists(), target
         if anchor:
             assert anchor in anchors(path.read_text(encoding="utf-8")), target

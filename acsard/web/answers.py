@@ -138,6 +138,8 @@ CONTENT_TYPES = {
     ".svg": "image/svg+xml",
     ".png": "image/png",
     ".ino": "text/plain; charset=utf-8",
+    ".txt": "text/plain; charset=utf-8",
+    ".zip": "application/zip",
     ".json": "application/json",
     ".webmanifest": "application/manifest+json",
 }

@@ -9,17 +9,20 @@ own copy of the contents.
 
 from __future__ import annotations
 
+import os
+import re
 import shutil
 import subprocess
 import sys
 import tempfile
+from collections.abc import Mapping
 from importlib import metadata
 from pathlib import Path
 from zipfile import ZIP_DEFLATED, ZipFile, ZipInfo
 
 HERE = Path(__file__).resolve().parent
-REPOSITORY = "https://github.com/acsard/acsard/blob/HEAD"
-SKETCH = "firmware/acsar/acsar.ino"
+ROOT = HERE.parents[1]
+SHOWN = ".ino"  # the page shows these files; the name of another one gets ".txt"
 
 
 def build(out: Path) -> None:
@@ -28,10 +31,7 @@ def build(out: Path) -> None:
         # zensical keeps a cache beside its sources.
         shutil.copytree(HERE / "pages", Path(place, "pages"))
         shutil.copy(HERE / "mkdocs.yml", place)
-        # A robot without internet has the sketch of its version, beside the page that leads to it.
-        shutil.copy(HERE.parent / SKETCH, Path(place, "pages/howto"))
-        flash = Path(place, "pages/howto/flash.md")
-        flash.write_text(flash.read_text().replace(f"{REPOSITORY}/deploy/{SKETCH}", "acsar.ino"))
+        carry_files(Path(place, "pages"))
         program = [sys.executable, "-m", "zensical", "build", "--strict", "-f", "mkdocs.yml"]
         done = subprocess.run(program, cwd=place, capture_output=True, text=True, check=False)
         if done.returncode:
@@ -40,11 +40,47 @@ def build(out: Path) -> None:
         licence = metadata.distribution("zensical").read_text("licenses/LICENSE.md")
         assert licence is not None
         (site / "assets/LICENSE").write_text(licence)
-        with ZipFile(out, "w", ZIP_DEFLATED) as archive:
-            for file in sorted(path for path in site.rglob("*") if path.is_file()):
-                # A ZipInfo without a date has the same one always.
-                name = ZipInfo(str(file.relative_to(site)))
-                archive.writestr(name, file.read_bytes(), ZIP_DEFLATED)
+        files = [path for path in site.rglob("*") if path.is_file()]
+        pack(out, {str(path.relative_to(site)): path for path in files})
+
+
+def carry_files(pages: Path) -> None:
+    """Copy each file of the repository to which a page leads, and correct the links.
+
+    A robot without internet has the files of its version. Of a directory it has a zip file.
+    """
+    for page in pages.rglob("*.md"):
+        there = HERE / "pages" / page.relative_to(pages)
+
+        def carried(match: re.Match[str], page: Path = page, there: Path = there) -> str:
+            source = (there.parent / match[1]).resolve()
+            if source.is_relative_to(HERE / "pages"):
+                return match[0]
+            copy = pages / "files" / source.relative_to(ROOT)
+            copy.parent.mkdir(parents=True, exist_ok=True)
+            if source.is_dir():
+                copy = copy.with_suffix(".zip")
+                files = [path for path in source.rglob("*") if path.is_file()]
+                pack(copy, {str(path.relative_to(source.parent)): path for path in files})
+            else:
+                if copy.suffix != SHOWN:
+                    copy = copy.with_name(f"{copy.name}.txt")
+                shutil.copy(source, copy)
+            return f"]({os.path.relpath(copy, page.parent)})"
+
+        text = page.read_text(encoding="utf-8")
+        page.write_text(re.sub(LINK, carried, text), encoding="utf-8")
+
+
+LINK = r"\]\((\.\.?/[^)#\s]+)(?:#[^)\s]*)?\)"
+
+
+def pack(out: Path, files: Mapping[str, Path]) -> None:
+    """Write a zip file. The same files give the same bytes."""
+    with ZipFile(out, "w", ZIP_DEFLATED) as archive:
+        for name in sorted(files):
+            # A ZipInfo without a date has the same one always.
+            archive.writestr(ZipInfo(name), files[name].read_bytes(), ZIP_DEFLATED)
 
 
 if __name__ == "__main__":
