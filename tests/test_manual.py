@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import html
 import re
 import runpy
 from contextlib import redirect_stdout
@@ -134,5 +135,7 @@ def test_the_manual_contains_the_files_of_its_version(site: dict[str, str]) -> N
     for name in carried:
         assert site[f"files/{name}"] == text_of(name.removesuffix(".txt"))
     assert "deploy/firmware.zip" in site["howto/flash.html"]
+    assert "acsard/&lt;id&gt;/..." in site["reference/settings.html"], "escaped"
+    assert "float | None" in html.unescape(site["reference/python.html"])
     # No link leads to a repository of which a robot has another version, or none.
     assert not [name for name, text in site.items() if "/blob/" in text]

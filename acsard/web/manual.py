@@ -28,6 +28,8 @@ MISSING = b"""<!doctype html>
 it for the next start of the page:
 <pre>.venv/bin/pip install '.[manual]'
 .venv/bin/python deploy/manual/build.py</pre>
+<p>A service has its own copy of the program. Then give it this one:
+<pre>sudo acsard service upgrade .venv</pre>
 <p>The same pages are Markdown in the source, in <code>deploy/manual/pages</code>.
 """
 

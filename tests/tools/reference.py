@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import argparse
 import ast
+import html
 import inspect
 import re
 from collections.abc import Callable, Iterable, Iterator
@@ -37,9 +38,17 @@ NOTE = "<!-- written by python -m tests.tools.tables -->"
 
 
 def table(head: tuple[str, ...], rows: Iterable[tuple[str, ...]]) -> str:
-    lines = [[cell.replace("|", "\\|") for cell in row] for row in (head, *rows)]
+    lines = [[_cell(text) for text in row] for row in (head, *rows)]
     top, *below = (f"| {' | '.join(cells)} |\n" for cells in lines)
     return "".join((top, "|---" * len(head) + "|\n", *below))
+
+
+def _cell(text: str) -> str:
+    # In code of a table, a \\ before | would be shown.
+    def code(match: re.Match[str]) -> str:
+        return f"<code>{html.escape(match[1], quote=False).replace('|', '&#124;')}</code>"
+
+    return re.sub(r"`([^`]*\|[^`]*)`", code, text).replace("|", "\\|")
 
 
 def _page(title: str, introduction: str, *parts: str) -> str:
@@ -208,7 +217,8 @@ def _literal(text: str) -> str:
     """Return plain text as Markdown, in which < and * outside of code stay as they are."""
     parts = re.split(r"(`[^`]*`)", " ".join(text.split()))
     return "".join(
-        part if part.startswith("`") else re.sub(r"([<*_])", r"\\\1", part) for part in parts
+        part if part.startswith("`") else re.sub(r"([*_])", r"\\\1", part).replace("<", "&lt;")
+        for part in parts
     )
 
 
