@@ -248,6 +248,16 @@ def sound(seed: int, seconds: float, wheels: WheelMap) -> tuple[Robot, Findings]
     return made, bench.said
 
 
+def swing(bench: Bench, dice: random.Random, one: Twist, other: Twist, each: float) -> None:
+    """Move the stick between two wishes for a while, on one slope, sometimes below a cap."""
+    until, slope = bench.now + dice.uniform(2.0, 20.0), dice.uniform(0.75, 1.15)
+    bench.cap = bench.robot.speed * dice.uniform(0.2, 1.0) if dice.random() < 0.2 else math.inf
+    while bench.now < until:
+        bench.gain = min(1.15, slope * (dice.uniform(0.6, 1.1) if dice.random() < 0.1 else 1.0))
+        bench.hold(one, each * dice.uniform(0.5, 1.5))
+        bench.hold(other, each * dice.uniform(0.5, 1.5))
+
+
 def restless(seed: int, seconds: float, wheels: WheelMap) -> tuple[Robot, Findings]:
     """Drive a sound robot whose stick moves to and fro between two wishes, on slopes."""
     dice = random.Random(seed)
@@ -257,13 +267,7 @@ def restless(seed: int, seconds: float, wheels: WheelMap) -> tuple[Robot, Findin
         one, other = twist(dice, made), twist(dice, made)
         if dice.random() < 0.5:
             other = Twist(one.linear * dice.uniform(-1, 1), one.angular * dice.uniform(-1, 1))
-        each, until = dice.uniform(0.1, 2.5), bench.now + dice.uniform(2.0, 20.0)
-        slope = dice.uniform(0.75, 1.15)
-        bench.cap = made.speed * dice.uniform(0.2, 1.0) if dice.random() < 0.2 else math.inf
-        while bench.now < until:
-            bench.gain = min(1.15, slope * (dice.uniform(0.6, 1.1) if dice.random() < 0.1 else 1.0))
-            bench.hold(one, each * dice.uniform(0.5, 1.5))
-            bench.hold(other, each * dice.uniform(0.5, 1.5))
+        swing(bench, dice, one, other, dice.uniform(0.1, 2.5))
     return made, bench.said
 
 
@@ -284,12 +288,7 @@ def overdue(seed: int, seconds: float, wheels: WheelMap) -> tuple[Robot, Finding
         if dice.random() < 0.5:
             other = Twist(one.linear * dice.uniform(-1, 1), one.angular * dice.uniform(-1, 1))
         each = dice.choice((dice.uniform(0.1, 2.5), dice.uniform(0.2, 5.0)))
-        until, slope = bench.now + dice.uniform(2.0, 20.0), dice.uniform(0.75, 1.15)
-        bench.cap = made.speed * dice.uniform(0.2, 1.0) if dice.random() < 0.2 else math.inf
-        while bench.now < until:
-            bench.gain = min(1.15, slope * (dice.uniform(0.6, 1.1) if dice.random() < 0.1 else 1.0))
-            bench.hold(one, each * dice.uniform(0.5, 1.5))
-            bench.hold(other, each * dice.uniform(0.5, 1.5))
+        swing(bench, dice, one, other, each)
     return made, bench.said
 
 
