@@ -249,6 +249,15 @@ FAIL wheel map: twice
     according to your answers, two motors turn the {wheel} wheel
     -> fix the motors above, and check again
 
+PASS least speed: small | {least:g} rad/s
+WARN? least speed: large | {least:g} rad/s
+    at {ignored:g} rad/s, which is {way:.2f} m/s, this motor or these do not turn: {motors}. A
+    planner's small speeds have no effect then, and its goals are reached late or never
+    -> let the firmware control the speed of the motors (the sketch does), or raise the least speed
+    of the planner above this
+SKIPPED least speed: untested
+    no motor followed its commands
+    -> fix the motors above, and check again
 SKIPPED encoder counts: none
     the firmware sends no counts
 WARN? encoder counts: coarse | about {about:.0f} per turn

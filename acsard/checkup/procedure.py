@@ -18,6 +18,7 @@ from acsard.checkup import (
     encoder_counts,
     inputs,
     lateness,
+    least_speed,
     line_loss,
     outcomes,
     restarts,
@@ -54,8 +55,8 @@ CONFIRMATION = (
 # without one.
 STEPS = (
     "baud rate", "identification", "reply form", "reply rate", "round trip", "checked link",
-    "lost lines", "motors", "trailing comma", "wheel map", "encoder counts", "watchdog",
-    "damaged lines", "inputs",
+    "lost lines", "motors", "trailing comma", "wheel map", "encoder counts", "least speed",
+    "watchdog", "damaged lines", "inputs",
 )  # fmt: skip
 
 # The first steps of the check, in order, each with a message for the operator.
@@ -124,7 +125,8 @@ def run(
                 raise StoppedError(outcomes.find("wheels: not lifted"))
             watched = _Watched(operator, board, asleep_ns)
             board.abort_check = watched.check_operator
-            _Steps(board, watched, once, all_restarts).all(config.safety)
+            steps_ = _Steps(board, watched, once, all_restarts, config.drive.wheel_radius)
+            steps_.all(config.safety)
     except StoppedError as end:
         once(end.finding)
         why = f"the check ended early: {end.finding.name}"
@@ -178,8 +180,10 @@ class _Steps:
         operator: Operator,
         tell: Callable[[Finding | None], None],
         seen: list[Restart],
+        radius: float,
     ) -> None:
         self._board, self._operator, self._tell = board, operator, tell
+        self._radius = radius
         # All restarts of the board so far. The caller of `all` reads this list afterward.
         self._all_restarts = seen
         self._channels: list[Channel] = []
@@ -199,6 +203,9 @@ class _Steps:
         self._take("", lambda: encoder_counts.finding(board, right))
         # If no motor is right, motors that are coupled or too slow show the watchdog too.
         turned = right or [channel.motor for channel in channels if channel.follows]
+        if board.repeats.encoders:
+            rising = "the motors turn slowly, then faster"
+            self._measure(rising, lambda: least_speed.finding(board, turned, self._radius))
         together = "the motors turn, then this computer sends nothing, perhaps several times"
         self._measure(together, lambda: watchdog.finding(board, turned))
         broken = "sending damaged lines; a motor that turns now is a fault"

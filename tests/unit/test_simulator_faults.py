@@ -124,6 +124,7 @@ def test_a_bit_error_flips_one_bit_and_a_different_one_each_time() -> None:
 
 
 EXAMPLES = {
+    "RAD/S": "1.0",
     "MOTOR": "b", "MOTOR:MOTOR": "b:c", "MOTOR:FACTOR": "b:2", "RATE": "9600", "M/S": "1",
     "EVERY:SECONDS": "5:0.1", "START:SECONDS": "5:0.1", "BUMPER:START:SECONDS": "1:5:2",
     "PERCENT:MINUTES": "5:0.1", "SECONDS": "5",

@@ -59,6 +59,7 @@ class Switches(Struct):
     encoders: tuple[int, ...]  # motor whose encoder is at each input
     encoder_signs: tuple[int, ...]  # -1: the motor's encoder is reversed
     now_ns: Ns = 0  # when the newest fault began
+    dead_band: float = 0.0  # rad/s: the motors ignore smaller commands
     muted: bool = False
     noise_bytes: bytes = b""
     cut_replies: bool = False
@@ -205,6 +206,8 @@ FAULTS = {
         lambda s, motor: replace(s, frozen=motor)),
     "dead_motor": Fault("MOTOR", "The motor ignores its commands.",
         lambda s, motor: replace(s, drives=_put(s.drives, motor, 0.0))),
+    "dead_band": Fault("RAD/S", "The motors ignore smaller commands.",
+        lambda s, least: replace(s, dead_band=least)),
     "reversed_motor": Fault("MOTOR", "The two leads of the motor are swapped: it turns backward.",
         lambda s, motor: replace(s, drives=_put(s.drives, motor, -s.drives[motor]))),
     "reversed_encoder": Fault("MOTOR", "The signals A and B of the encoder are swapped.",

@@ -230,6 +230,8 @@ class FakeMcu:
         for output, value in command.values.items():
             motor = self.switches.drivers[output]
             wheels, forward = self._wiring[motor]
+            if abs(value) < self.switches.dead_band:
+                value = 0.0
             for wheel in wheels:
                 set_points[wheel] = forward * self.switches.drives[motor] * value
         self.valid_lines += 1
