@@ -129,6 +129,8 @@ def by_ros() -> Iterator[Row]:
         yield Row("put", ros.rmw_key(name, ros.STAMPED), DRIVERS, stamped)
     for key in ("speed_limit", ros.rmw_key("speed_limit", ros.SPEED_LIMIT)):
         yield Row("put", key, DRIVERS, _bad_limit)
+    for key in ("stop_request", ros.rmw_key("stop_request", ros.EMPTY)):
+        yield Row("put", key, ANYBODY, ros.EMPTY_REQUEST)
     for key in ("joint_commands", ros.rmw_key("joint_commands", ros.JOINTS)):
         yield Row("put", key, DRIVERS, lambda: ros.joints(0.0))
     end = RMW_TWIST.removeprefix("0/cmd_vel/")
