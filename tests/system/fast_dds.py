@@ -149,6 +149,16 @@ def python_with_rclpy(cache: Path) -> str:
     return python
 
 
+def ros_environment(domain: int, where: Path) -> dict[str, str]:
+    """Return the environment of a program of rclpy on Fast DDS."""
+    return bare_environment() | {
+        "RMW_IMPLEMENTATION": "rmw_fastrtps_cpp",
+        "ROS_DOMAIN_ID": str(domain),
+        "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
+        "ROS_LOG_DIR": str(where / "ros-log"),
+    }
+
+
 class _Output(list[str]):
     """The output of the process, which passes each sample on at once."""
 
@@ -173,13 +183,7 @@ class FastDdsNode(Client):
 
     def __init__(self, python: str, domain: int, where: Path) -> None:
         super().__init__()
-        own = {
-            "RMW_IMPLEMENTATION": "rmw_fastrtps_cpp",
-            "ROS_DOMAIN_ID": str(domain),
-            "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
-            "ROS_LOG_DIR": str(where / "ros-log"),
-        }
-        words, env = [python, "-c", PROGRAM], bare_environment() | own
+        words, env = [python, "-c", PROGRAM], ros_environment(domain, where)
         self.program = Program(words, where, env, stdin=subprocess.PIPE)
         self.program.out = self._output = _Output()
         self._number = 0

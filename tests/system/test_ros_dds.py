@@ -14,8 +14,8 @@ import pytest
 
 from tests.system import fast_dds
 from tests.system.builds import BUILD_S
-from tests.system.fast_dds import FastDdsNode
-from tests.system.harness import ROOT, Bus, Daemon, free_endpoint
+from tests.system.fast_dds import FastDdsNode, ros_environment
+from tests.system.harness import ROOT, Bus, Daemon, finish, free_endpoint
 from tests.system.ros_clients import (
     EMPTY,
     EMPTY_REQUEST,
@@ -95,6 +95,20 @@ def test_the_bridge_drops_the_service_calls_of_a_fast_dds_node_and_the_pages_say
         node.put("stop_request", EMPTY, EMPTY_REQUEST)
         bus.comes_to("stopped")
     assert DROPPED in (PAGES / "ros-trouble.md").read_text()
+
+
+def test_drive_py_drives_with_a_real_rclpy(tmp_path: Path, dds: NewDomain, rclpy: str) -> None:
+    with (
+        Daemon(tmp_path) as daemon,
+        Bus(daemon.endpoint) as bus,
+        dds(tmp_path) as domain,
+        domain.bridge(daemon.endpoint),
+    ):
+        bus.linked()
+        words = [rclpy, str(ROOT / "deploy/ros2/drive.py"), "0.2", "0.0", "3"]
+        done = finish(words, tmp_path, env=ros_environment(domain.number, tmp_path))
+        assert done.code == 0, done
+        assert 0.2 < bus.at_rest()["x"] < 0.7  # a busy machine interrupts the drive
 
 
 def test_without_the_wheels_of_rclpy_the_tests_fail_and_say_so(
