@@ -108,7 +108,7 @@ def test_drive_py_drives_with_a_real_rclpy(tmp_path: Path, dds: NewDomain, rclpy
         words = [rclpy, str(ROOT / "deploy/ros2/drive.py"), "0.2", "0.0", "3"]
         done = finish(words, tmp_path, env=ros_environment(domain.number, tmp_path))
         assert done.code == 0, done
-        assert 0.2 < bus.at_rest()["x"] < 0.7  # a busy machine interrupts the drive
+        assert 0.2 < bus.at_rest()["x"] < 1.0  # a busy machine interrupts or prolongs it
 
 
 def test_without_the_wheels_of_rclpy_the_tests_fail_and_say_so(
