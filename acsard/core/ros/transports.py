@@ -187,6 +187,11 @@ def command_keys(ros: RosConfig) -> tuple[str, ...]:
     return tuple({e.key: None for e in incoming})
 
 
+def stop_keys(ros: RosConfig) -> tuple[str, ...]:
+    """Return the Zenoh keys on which stops arrive from ROS."""
+    return tuple(e.key for e in endpoints(ros, "0") if e.native == STOP)
+
+
 def announced_publishers(config: Config) -> tuple[tuple[str, str, Transport], ...]:
     """Return the tokens of publishers for the sources where a pause arms, as key expressions.
 
