@@ -107,6 +107,16 @@ def put(topic, type_name, payload, seconds, **qos):
     publishers[key].publish(base64.b64decode(payload))
     return True
 
+def topic_pub(topic, type_name, rate, times):
+    # As `ros2 topic pub -r RATE -t TIMES` does: a new publisher, which waits for one subscription.
+    publisher = node.create_publisher(found(type_name), topic, quality())
+    while not publisher.get_subscription_count():
+        time.sleep(0.1)
+    for _ in range(times):
+        publisher.publish(found(type_name)())
+        time.sleep(1 / rate)
+    node.destroy_publisher(publisher)
+
 def call(service, type_name, payload, seconds, available):
     kind = found(type_name)
     if service not in clients:
@@ -120,7 +130,7 @@ def call(service, type_name, payload, seconds, available):
     return {"listed": listed, "reply": text(serialize_message(future.result())) if done else None}
 
 say("ready")
-verbs = {f.__name__: f for f in (follow, unfollow, put, call)}
+verbs = {f.__name__: f for f in (follow, unfollow, put, topic_pub, call)}
 for line in sys.stdin:
     number, verb, args, kwargs = json.loads(line)
     try:

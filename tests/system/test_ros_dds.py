@@ -6,6 +6,7 @@ same bridge. The first run builds the bridge, and installs rclpy for the nodes o
 
 from __future__ import annotations
 
+import re
 import time
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -30,6 +31,8 @@ if TYPE_CHECKING:
     from tests.system.dds import NewDomain
 
 PAGES = ROOT / "deploy/manual/pages/howto"
+
+COMMAND = r"ros2 topic pub -r (\d+) -t (\d+) /stop_request std_msgs/msg/Empty"
 
 DROPPED = "received invalid request"
 """What the bridge logs for each request without the header of Cyclone DDS."""
@@ -109,6 +112,29 @@ def test_drive_py_drives_with_a_real_rclpy(tmp_path: Path, dds: NewDomain, rclpy
         done = finish(words, tmp_path, env=ros_environment(domain.number, tmp_path))
         assert done.code == 0, done
         assert 0.2 < bus.at_rest()["x"] < 1.0  # a busy machine interrupts or prolongs it
+
+
+def test_the_command_of_the_pages_stops_the_robot_with_each_new_publisher(
+    tmp_path: Path, dds: NewDomain, rclpy: str
+) -> None:
+    found = {
+        page: re.findall(COMMAND, (PAGES / f"{page}.md").read_text())
+        for page in ("ros", "ros-tools", "nav2", "stop")
+    }
+    assert all(found.values())
+    ((rate, times),) = {command for commands in found.values() for command in commands}
+    with (
+        Daemon(tmp_path) as daemon,
+        Bus(daemon.endpoint) as bus,
+        dds(tmp_path) as domain,
+        domain.bridge(daemon.endpoint),
+    ):
+        bus.linked()
+        for _ in range(5):
+            with FastDdsNode(rclpy, domain.number, tmp_path) as node:
+                node.do("topic_pub", "/stop_request", EMPTY, float(rate), int(times))
+            numbers = [cause["number"] for cause in bus.comes_to("stopped")["causes"]]
+            assert bus.get("srv/clear", {"numbers": numbers})["success"]
 
 
 def test_without_the_wheels_of_rclpy_the_tests_fail_and_say_so(
