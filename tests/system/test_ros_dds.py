@@ -87,10 +87,11 @@ def test_the_bridge_drops_the_service_calls_of_a_fast_dds_node_and_the_pages_say
         FastDdsNode(rclpy, domain.number, tmp_path) as node,
     ):
         bus.linked()
-        called = node.call("acsard/stop")
-        assert (called.replies, bus.state()["mode"]) == ([], "ready"), (
-            "the bridge answers now: say so in howto/ros, howto/ros-trouble and the contract"
-        )
+        for _ in range(3):  # the first request of a new client may be lost on its way to the bridge
+            called = node.call("acsard/stop")
+            assert (called.replies, bus.state()["mode"]) == ([], "ready"), (
+                "the bridge answers now: say so in howto/ros, howto/ros-trouble and the contract"
+            )
         bridge.logs(DROPPED)
         # The subscription is reliable, so that DDS sends a lost stop again.
         matched = node.do("put", "/stop_request", EMPTY, "", 2.0, best_effort=True)
