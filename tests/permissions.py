@@ -129,12 +129,17 @@ def by_ros() -> Iterator[Row]:
         yield Row("put", ros.rmw_key(name, ros.STAMPED), DRIVERS, stamped)
     for key in ("speed_limit", ros.rmw_key("speed_limit", ros.SPEED_LIMIT)):
         yield Row("put", key, DRIVERS, _bad_limit)
+    for key in ("stop_request", ros.rmw_key("stop_request", ros.EMPTY)):
+        yield Row("put", key, ANYBODY, ros.EMPTY_REQUEST)
     for key in ("joint_commands", ros.rmw_key("joint_commands", ros.JOINTS)):
         yield Row("put", key, DRIVERS, lambda: ros.joints(0.0))
     end = RMW_TWIST.removeprefix("0/cmd_vel/")
-    wild = ("cmd_vel/**", "cmd_v$*", "*", "0/cmd_vel/**", f"0/*/{end}", f"*/cmd_vel/{end}", "0/**",
+    wild = ("cmd_vel/**", "cmd_v$*", "0/cmd_vel/**", f"0/*/{end}", f"*/cmd_vel/{end}",
             "other/cmd_vel", f"0/other/cmd_vel/{end}", f"1/cmd_vel/{end}")  # fmt: skip
     yield from (Row("put", key, NOBODY, zero) for key in wild)
+    # A PUT that reaches `stop_request` stops, by any key expression.
+    reaching = ("*", "stop_re$*", "0/**", "0/stop_request/**")
+    yield from (Row("put", key, HERE, zero) for key in reaching)
     written = [key for name, kind in (("odom", ros.ODOMETRY), ("tf_static", ros.TF))
                for key in (name, ros.rmw_key(name, kind))]  # fmt: skip
     yield from (Row("put", key, NOBODY, FORGED) for key in written)

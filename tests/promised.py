@@ -44,7 +44,7 @@ PROMISED = (
     Promise("wheel_cmd/<source>/<certificate>", "in", "JointState", "operator"),
     Promise("imu", "in", "Imu", "maintainer", "imu/data", always=False),
     Promise("speed_limit", "in", "SpeedLimit", "operator", "speed_limit"),
-    Promise("stop", "in", "anything", "viewer"),
+    Promise("stop", "in", "anything", "viewer", "stop_request"),
     Promise("gateway", "in", "GatewayState", None),
     Promise("srv/stop", "service", "ServiceReply", "viewer", "acsard/stop"),
     Promise("srv/clear", "service", "ServiceReply", "operator", "acsard/clear"),

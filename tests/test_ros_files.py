@@ -237,6 +237,13 @@ def test_nav2s_chain_ends_at_cmd_vel_in_one_type() -> None:
     assert stamped == [False] * 5
 
 
+def test_nav2_s_servers_have_time_to_answer_on_a_busy_computer() -> None:
+    """With Nav2's own 20 ms the robot drove 3.1 m on a goal that was reported as aborted."""
+    timeout_ms = ros_parameters("nav2_params.yaml", "bt_navigator")["default_server_timeout"]
+    assert type(timeout_ms) is int, "ROS refuses a double where a node declares an integer"
+    assert timeout_ms >= 200
+
+
 def test_nav2_py_puts_the_robot_s_values_into_nav2_s_file_and_keeps_the_rest(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -269,6 +276,22 @@ def leaves(tree: dict[str, Any]) -> list[tuple[str, Any]]:
     for key, value in tree.items():
         pairs += leaves(value) if isinstance(value, dict) else [(key, value)]
     return pairs
+
+
+# ekf.yaml
+
+
+def test_the_ekf_takes_the_speeds_of_each_sample_in_the_robot_s_frames() -> None:
+    ekf = ros_parameters("ekf.yaml", "ekf_filter_node")
+    frames = CONFIG.odometry.odom_frame, CONFIG.odometry.base_frame
+    assert (ekf["odom_frame"], ekf["base_link_frame"]) == frames
+    assert (ekf["world_frame"], ekf["publish_tf"]) == (ekf["odom_frame"], True)
+    assert f"/{ekf['odom0']}" in published_names("out")
+    # The places of vx, vy and the speed of yaw. The pose would count the same wheels twice.
+    assert [place for place, used in enumerate(ekf["odom0_config"]) if used] == [6, 7, 11]
+    assert len(ekf["odom0_config"]) == 15
+    assert ekf["frequency"] * ekf["odom0_queue_size"] >= CONFIG.rate_hz
+    assert "--params-file deploy/ros2/ekf.yaml" in manual("howto/ros-tools")
 
 
 # acsar.launch.py

@@ -14,7 +14,15 @@ from acsard.bus.address import require_id
 from acsard.bus.subscription import Subscription
 from acsard.core.config.settings import is_tls
 from acsard.core.formatting import listed, many
-from acsard.core.messages.keys_and_roles import JSON_TREE, Topic, by_key, full_key, key_hint, row_of
+from acsard.core.messages.keys_and_roles import (
+    JSON_TREE,
+    STOP,
+    Topic,
+    by_key,
+    full_key,
+    key_hint,
+    row_of,
+)
 from acsard.core.messages.signature import Signature
 from acsard.core.values import ROOT_KEY
 from acsard.host.errors import NoAnswerError, UsageError
@@ -79,7 +87,7 @@ def stop(session: zenoh.Session, ids: Sequence[str], sender: str) -> None:
     """Send a stop to these robots ("*" for all), without waiting for an answer."""
     by = Signature(sender).pack()
     for robot_id in ids:
-        session.put(full_key(robot_id, "stop"), b"", attachment=by, express=True)
+        session.put(full_key(robot_id, STOP), b"", attachment=by, express=True)
 
 
 def count_text(endpoint: str, robots: int) -> str:

@@ -18,7 +18,7 @@ import zenoh
 from acsard.bus.tls_files import CA, CERTIFICATE, KEY, files_in, host_and_port, require_usable
 from acsard.bus.tls_trouble import RENEW_ADVICE, trouble
 from acsard.core.config.settings import TLS_PREFIX, Config, is_tls
-from acsard.core.messages.keys_and_roles import IMU, SPEED_LIMIT, full_key, source_keys
+from acsard.core.messages.keys_and_roles import IMU, SPEED_LIMIT, STOP, full_key, source_keys
 from acsard.host import clock
 from acsard.host.errors import (
     CertificateError,
@@ -85,12 +85,13 @@ def gateway_session(config: Config) -> zenoh.Session:
     Raises `CertificateError` if Zenoh refuses the files, and `InUseError` if it cannot listen.
     """
     from acsard.bus.access_rules import gateway_access
+    from acsard.core.ros.transports import stop_keys
 
     bus = config.bus
     settings = _base("router") | RETRY_SETTINGS | _tls(bus.tls) | _listening()
     # Limit only PUT messages. Otherwise a flood of DELETE messages, which are not stops, would use
     # up the limit of the stops. The daemon's own session does not limit stops.
-    stops = _rate_limit("stops", ["put"], [full_key(config.robot.id, "stop")])
+    stops = _rate_limit("stops", ["put"], [full_key(config.robot.id, STOP), *stop_keys(config.ros)])
     settings |= {
         "access_control": gateway_access(config),
         "downsampling": [_command_limits(config), stops],

@@ -30,7 +30,7 @@ from acsard.core.incoming.commands import (
 from acsard.core.incoming.imu import GyroFollower
 from acsard.core.incoming.queries import Query
 from acsard.core.messages.encodings import DecodeError
-from acsard.core.messages.keys_and_roles import IMU, SPEED_LIMIT
+from acsard.core.messages.keys_and_roles import IMU, SPEED_LIMIT, STOP
 from acsard.core.motion.kinematics import Kinematics
 from acsard.core.values import Announcement, Command, Event, GyroSample, Refusal, Request, SpeedCap
 
@@ -97,7 +97,7 @@ class Intake:
             self.counters["bus_overrun"] += batch.overrun
         for arrival in batch.arrivals:
             try:
-                if arrival.key == "stop":
+                if arrival.key == STOP:
                     requests.append(_stop(arrival))
                 elif arrival.key == IMU:
                     sample = self._imu.receive(arrival, self.counters, self.events)
@@ -135,7 +135,7 @@ class Intake:
         return [
             caller_name(arrival.via, arrival.attachment, arrival.sender)
             for arrival in self._batch.arrivals
-            if arrival.key == "stop" and arrival.put
+            if arrival.key == STOP and arrival.put
         ]
 
     def last_stops(self) -> list[str]:
@@ -163,7 +163,7 @@ def _stop(arrival: Arrival) -> Request:
 
 
 def _refusal(arrival: Arrival, code: RefusalCode, text: str) -> Refusal:
-    if arrival.key in ("stop", SPEED_LIMIT):
+    if arrival.key in (STOP, SPEED_LIMIT):
         return Refusal(code, text)
     sender = claimed_identity(arrival).sender
     return Refusal(code, text, parts(arrival.key)[1], sender, arrival.arrived_ns)

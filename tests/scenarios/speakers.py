@@ -161,5 +161,12 @@ def over(
 
 def moved(world: World, since_ns: int) -> bool:
     """Return whether the daemon has sent a line with a wheel speed since `since_ns`."""
+    return first_motion(world, since_ns) is not None
+
+
+def first_motion(world: World, since_ns: int) -> float | None:
+    """Return how long after `since_ns` the daemon has sent a wheel speed, s, or None."""
     still = (b"ap00.00,bp00.00,cp00.00,dp00.00\r\n", b"?\r\n")
-    return any(at_ns >= since_ns and line not in still for at_ns, line in world.port.sent)
+    moving_ns = (at for at, line in world.port.sent if at >= since_ns and line not in still)
+    first_ns = next(moving_ns, None)
+    return None if first_ns is None else (first_ns - since_ns) / NS_PER_S

@@ -11,7 +11,7 @@ import random
 import re
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any, Literal, NamedTuple, get_args
 
 import msgspec
 import pytest
@@ -19,7 +19,7 @@ import pytest
 from acsard.core.messages.encodings import encode
 from acsard.core.messages.schema import Header, JointState, Time, Twist, TwistStamped, Vector3
 from acsard.core.values import NS_PER_S
-from tests.scenarios.speakers import Speaker, moved
+from tests.scenarios.speakers import Speaker, first_motion, moved
 from tests.scenarios.world import World
 
 Road = Literal["rmw", "bridge"]
@@ -424,3 +424,100 @@ def test_the_first_of_two_publishers_drives_by_rmw_and_both_drive_by_the_bridge(
     assert least <= min(speeds[60:]) <= max(speeds[60:]) <= most
     second.hold(0.2, 1.0)
     assert world.state.linear == pytest.approx(0.2, abs=0.02)
+
+
+class Recorded(NamedTuple):
+    """What a real Nav2 published on `cmd_vel` after an event, and when the robot drove then."""
+
+    event: Literal["restart", "clear"]
+    row: str
+    """The first words of the row for it in the table of the page howto/nav2."""
+    parts: list[tuple[float | None, float, float]]
+    """Speed (None: nothing), Hz and s of each part. A speed follows them."""
+    after_s: float | None
+    """When the robot drove, after the event; None if it did not."""
+
+
+ZEROS_HZ = 5.0
+"""The rate of collision_monitor's zeros while its scan is invalid, because TF stops."""
+
+TABLE = SPEEDS, ZEROS, RESTED, AGAIN = "speeds", "zeros, and", "a zero, and", "the path again"
+FOLLOWED = (0.5, 20.0, 8.0)
+END = (0.0, 20.0, 0.05)
+
+RECORDED = {
+    "a filter's zeros": Recorded("restart", RESTED, [(0.0, ZEROS_HZ, 1.8), (None, 1.0, 1.3)], 3.1),
+    "the last of a filter's zeros": Recorded(
+        "restart", RESTED, [(0.0, ZEROS_HZ, 0.2), (None, 1.0, 1.3)], 1.5
+    ),
+    "no zero": Recorded("restart", SPEEDS, [(None, 1.0, 1.3)], None),
+    "zeros without a second of rest": Recorded(
+        "restart", ZEROS, [(0.5, 20.0, 3.0), (0.0, ZEROS_HZ, 0.8)], None
+    ),
+    "the path is sent again": Recorded("clear", AGAIN, [FOLLOWED, END, (None, 1.0, 1.3)], 9.4),
+    "the path is sent again later": Recorded(
+        "clear", AGAIN, [(0.5, 20.0, 12.0), END, (None, 1.0, 2.0)], 14.1
+    ),
+    "the path is sent again at once": Recorded(
+        "clear", ZEROS, [FOLLOWED, END, (None, 1.0, 0.6)], None
+    ),
+    "the controller waits in mid-goal": Recorded(
+        "clear", RESTED, [FOLLOWED, (0.0, 20.0, 1.2)], 9.3
+    ),
+    "a gap in mid-goal": Recorded("clear", SPEEDS, [FOLLOWED, (None, 1.0, 1.3)], None),
+    "a new goal after a cancelled one": Recorded(
+        "clear", RESTED, [(0.0, 20.0, 2.0), (None, 1.0, 3.0)], 5.1
+    ),
+}
+
+
+@pytest.mark.parametrize("road", ["rmw", "bridge"])
+@pytest.mark.parametrize("name", RECORDED)
+def test_a_goal_under_way_drives_on_after_a_second_of_rest_and_not_before(
+    name: str, road: Road
+) -> None:
+    event, _, parts, after_s = RECORDED[name]
+    world = World()
+    nav2 = Speaker(world, road)
+    nav2.key, nav2._sent = "cmd/nav", 5000  # it has run for longer than this daemon
+    nav2.announce()
+    world.run(0.3)
+    if event == "clear":
+        nav2.open(0.5)
+        assert world.call("stop").success
+        nav2.hold(0.5, CLEAR_S)
+        assert world.call("clear").success
+    since_ns = world.now_ns
+    for linear, hz, seconds in [*parts, (0.5, 20.0, 2.0)]:
+        if linear is None:
+            world.run(seconds)
+        else:
+            nav2.hold(linear, seconds, hz)
+    drove = first_motion(world, since_ns)
+    if after_s is None:
+        assert drove is None
+        assert world.state.code == "neutral"
+    else:
+        assert drove == pytest.approx(after_s, abs=0.3)
+
+
+ONE_PLACE = "starts again by itself"
+
+
+def test_one_page_says_how_long_after_an_event_a_goal_under_way_drives_on() -> None:
+    pages = ROS2.parent / "manual/pages"
+    words = {f"{path.parent.name}/{path.stem}": path.read_text() for path in pages.rglob("*.md")}
+    words["nav2_params"] = (ROS2 / "nav2_params.yaml").read_text().replace("\n# ", " ")
+    assert [name for name, text in words.items() if ONE_PLACE in text] == ["howto/nav2"]
+    said = re.search(r"(\d+) to (\d+) s after", words["howto/nav2"])
+    assert said is not None
+    rows = re.findall(r"^\| ([^|]+) \| (yes|no)\b", words["howto/nav2"], re.M)
+    assert [text.startswith(row) for text, _ in rows for row in TABLE].count(True) == len(rows)
+    for recorded in RECORDED.values():
+        (answer,) = {answer for text, answer in rows if text.startswith(recorded.row)}
+        assert answer == ("no" if recorded.after_s is None else "yes")
+        if recorded.after_s is not None:
+            assert float(said[1]) <= recorded.after_s <= float(said[2]) + 0.5
+    linked = {name for name, text in words.items() if "nav2.md#a-goal-that-is-under-way" in text}
+    behind = ("commands", "emergency-stop", "modes", "restart")
+    assert linked == {"howto/ros-drive", *(f"explanation/{name}" for name in behind)}

@@ -46,14 +46,14 @@ def ros2dds_bridge(cache: Path) -> str:
     """Return the installed zenoh-bridge-ros2dds, or build the program in `tests/ros2dds`."""
     if (path := shutil.which("zenoh-bridge-ros2dds")) is not None:
         return path
-    cargo = program("cargo", "it builds the bridge in tests/ros2dds")
-    for tool in ("cmake", "c++"):
-        program(tool, "it builds the Cyclone DDS of the bridge")
+    for tool in ("cargo", "cmake", "c++"):
+        if shutil.which(tool) is None:
+            pytest.fail(f"no {tool} on the PATH: it builds the bridge in tests/ros2dds")
     target = cache / "ros2dds"
-    words = [cargo, "build", "--quiet", "--locked"]
+    words = ["cargo", "build", "--quiet", "--locked"]
     done = finished(words, ROOT / "tests/ros2dds", CARGO_TARGET_DIR=str(target))
     if done.returncode != 0 and "Unable to find libclang" in done.stderr:
-        pytest.skip(LIBCLANG)
+        pytest.fail(LIBCLANG)
     assert done.returncode == 0, done.stderr
     return str(target / "debug/ros2dds")
 

@@ -12,15 +12,17 @@ import secrets
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import AbstractContextManager, ExitStack, contextmanager
 from pathlib import Path
-from typing import Any, ClassVar, NamedTuple
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
 import msgspec
 import numpy as np
 import pytest
 import zenoh
 
+from tests.system.builds import BUILD_S
+from tests.system.fast_dds import FastDdsNode
 from tests.system.harness import (
     Bus,
     Daemon,
@@ -30,6 +32,8 @@ from tests.system.harness import (
 )
 from tests.system.ros_clients import (
     DIAGNOSTICS,
+    EMPTY,
+    EMPTY_REQUEST,
     JOINTS,
     PARAMETER_SERVICES,
     REQUESTS,
@@ -37,6 +41,7 @@ from tests.system.ros_clients import (
     TWIST,
     WHEELS,
     BridgeHalf,
+    Client,
     RmwClient,
     ZenohClient,
     decode,
@@ -47,6 +52,9 @@ from tests.system.ros_clients import (
     stamped,
 )
 from tests.system.ros_clients import twist as ros_twist
+
+if TYPE_CHECKING:
+    from tests.system.dds import NewDomain
 
 LATE_S = 1.0
 """How late a late command is: four timeouts."""
@@ -352,7 +360,13 @@ class Ros(Door):
         "end": BARE,
     }
     source, numbers = "nav", False
-    ros: ZenohClient
+    pause_s = 0.0
+    """The time after a zero in which no speed may follow, because several nodes are one sender."""
+    ros: Client
+
+    def arm(self) -> None:
+        super().arm()
+        time.sleep(self.pause_s)
 
     def send(self, linear: float, angular: float = 0.0) -> None:
         self.ros.put("cmd_vel", TWIST, ros_twist(linear, angular))
@@ -371,13 +385,9 @@ class Ros(Door):
 
     def bad(self) -> dict[str, Send]:
         put, few = self.ros.put, joints(6.0, WHEELS[:3])
-        ros, whole, key = self.ros, ros_twist(0.5), self.ros.key("cmd_vel", TWIST)
         return {
             "not_finite": lambda: put("cmd_vel", TWIST, ros_twist(float("nan"))),
             "wrong_wheels": lambda: put("joint_commands", JOINTS, few),
-            "malformed": lambda: put("cmd_vel", TWIST, whole[:-1]),
-            "too_big": lambda: put("cmd_vel", TWIST, whole + bytes(5000)),
-            "not_a_put": lambda: ros.session.delete(key, attachment=ros.attachment()),
         }
 
     def set(self, key: str, value: float) -> bool:
@@ -400,8 +410,23 @@ class Ros(Door):
         return f"{values['mode']}: {mode.message}"
 
 
-class Rmw(Ros):
-    name, marks = "rmw_zenoh", pytest.mark.network
+class OverZenoh(Ros):
+    """A ROS node that can also put malformed bytes."""
+
+    marks: Any = pytest.mark.network
+    ros: ZenohClient
+
+    def bad(self) -> dict[str, Send]:
+        ros, whole, key = self.ros, ros_twist(0.5), self.ros.key("cmd_vel", TWIST)
+        return super().bad() | {
+            "malformed": lambda: ros.put("cmd_vel", TWIST, whole[:-1]),
+            "too_big": lambda: ros.put("cmd_vel", TWIST, whole + bytes(5000)),
+            "not_a_put": lambda: ros.session.delete(key, attachment=ros.attachment()),
+        }
+
+
+class Rmw(OverZenoh):
+    name = "rmw_zenoh"
 
     def open(self) -> None:
         self.ros = RmwClient(self.bus.session)
@@ -414,20 +439,42 @@ class Rmw(Ros):
         }
 
 
-class Bridge(Ros):
-    """All nodes behind a bridge are one sender: no speed may follow its zero for a second."""
-
-    name = "ros2dds bridge, emulated"
-    marks: Any = pytest.mark.network
+class EmulatedBridge(OverZenoh):
+    name, pause_s = "ros2dds bridge, emulated", 1.1
 
     def open(self) -> None:
         self.ros = BridgeHalf(self.bus.session)
-
-    def arm(self) -> None:
-        super().arm()
-        time.sleep(1.1)
 
     def bad(self) -> dict[str, Send]:
         between = ros_twist(0.5) + bytes(8)  # neither a Twist nor a TwistStamped
         put = self.bus.session.put
         return super().bad() | {"wrong_shape": lambda: put("cmd_vel", between)}
+
+
+class CycloneDds(Ros):
+    name, pause_s = "bridge with Cyclone DDS", 1.1
+    marks: Any = (pytest.mark.bridge, pytest.mark.timeout(BUILD_S))
+
+    def open(self) -> None:
+        domains: NewDomain = self.robot.request.getfixturevalue("dds")
+        domain = self.stack.enter_context(domains(self.robot.where))
+        self.stack.enter_context(domain.bridge(self.robot.endpoint))
+        self.ros = self.stack.enter_context(self.node(domain.number))
+
+    def node(self, domain: int) -> AbstractContextManager[Client]:
+        from tests.system.dds import DdsNode
+
+        return DdsNode(domain)
+
+
+class FastDds(CycloneDds):
+    name = "bridge with Fast DDS"
+    lacks: ClassVar = CycloneDds.lacks | dict.fromkeys(
+        ("clear", "set"), "the bridge drops the service calls of a Fast DDS node"
+    )
+
+    def node(self, domain: int) -> AbstractContextManager[Client]:
+        return FastDdsNode(self.robot.request.getfixturevalue("rclpy"), domain, self.robot.where)
+
+    def stop(self) -> None:
+        self.ros.put("stop_request", EMPTY, EMPTY_REQUEST)

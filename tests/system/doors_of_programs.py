@@ -25,8 +25,10 @@ from tests.system.browser import NAME, Page
 from tests.system.builds import CLIENTS, copied, node_program, program, run
 from tests.system.doors import (
     LATE_S,
-    Bridge,
+    CycloneDds,
     Door,
+    EmulatedBridge,
+    FastDds,
     Gateway,
     Json,
     Msgpack,
@@ -386,11 +388,14 @@ class Curl(WebSocket):
 
 
 class Example(WebSocket):
-    """A program of `deploy/clients` that drives for two seconds through the page."""
+    """A program of `deploy/clients` that drives for two seconds through the page.
+
+    It only drives: `stop` uses the same interface of the page.
+    """
 
     zeroes, speeds = True, (0.2, 0.0)
     lacks: ClassVar = dict.fromkeys(
-        ("stop", "clear", "silence", "late", "bad", "set", "state", "role"), "it only drives"
+        ("clear", "silence", "late", "bad", "set", "state", "role"), "it only drives"
     )
 
     def words(self) -> list[str]:
@@ -427,6 +432,6 @@ class Go(Example):
 
 
 DOORS: tuple[type[Door], ...] = (
-    Json, Msgpack, Rmw, Bridge, WebSocket, Foxglove, CommandLine, Sync, Async, Curl,
-    Node, Java, Go, Gateway, Router,
+    Json, Msgpack, Rmw, EmulatedBridge, CycloneDds, FastDds, WebSocket, Foxglove, CommandLine,
+    Sync, Async, Curl, Node, Java, Go, Gateway, Router,
 )  # fmt: skip

@@ -45,6 +45,7 @@ JOINTS, DIAGNOSTICS = "sensor_msgs/msg/JointState", "diagnostic_msgs/msg/Diagnos
 BATTERY = "sensor_msgs/msg/BatteryState"
 TRIGGER = "std_srvs/srv/Trigger"
 SPEED_LIMIT = "nav2_msgs/msg/SpeedLimit"
+EMPTY = "std_msgs/msg/Empty"
 LIST, GET = "rcl_interfaces/srv/ListParameters", "rcl_interfaces/srv/GetParameters"
 
 HASHES = {
@@ -53,6 +54,7 @@ HASHES = {
     ODOMETRY: "3cc97dc7fb7502f8714462c526d369e35b603cfc34d946e3f2eda2766dfec6e0",
     TF: "e369d0f05a23ae52508854b66f6aa0437f3449d652e8cbf22d5abe85d020f087",
     SPEED_LIMIT: "83d8e4e842559f4d9a988b19d31b162216ec738536389f98438d1a166f91845a",
+    EMPTY: "20b625256f32d5dbc0d04fee44f43c41e51c70d3502f84b4a08e7a9c26a96312",
     JOINTS: "a13ee3a330e346c9d87b5aa18d24e11690752bd33a0350f11c5882bc9179260e",
     DIAGNOSTICS: "5a8a36efb05fb25070fa0fb3810290c0e6cd4862b54a8fb975a1ee8dc55a333e",
     BATTERY: "4bee5dfce981c98faa6828b868307a0a73f992ed0789f374ee96c8f840e69741",
@@ -86,6 +88,9 @@ PUBLISHED = {
 
 TWISTS = ("cmd_vel", "cmd_vel_dock", "cmd_vel_teleop")
 """The topics that take both types of twists."""
+
+SUBSCRIBED = {"joint_commands": JOINTS, "speed_limit": SPEED_LIMIT, "stop_request": EMPTY}
+"""The robot's subscriptions with one type, which are announced over both transports."""
 
 PARAMETER_SERVICES = {
     "describe_parameters": "rcl_interfaces/srv/DescribeParameters",
@@ -231,7 +236,7 @@ PAYLOADS: dict[str, Callable[[float], bytes]] = {TWIST: twist, STAMPED: stamped,
 """How each type requests a speed."""
 
 EMPTY_REQUEST = b"\0\1\0\0\0"
-"""A request without fields."""
+"""A message or a request without fields."""
 
 
 # names on the wire

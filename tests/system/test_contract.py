@@ -108,5 +108,11 @@ def test_the_promise_holds_through_the_door(
     door.bus.at_rest()
 
 
+def test_every_door_that_can_drive_can_stop() -> None:
+    drives = [door for door in DOORS if "units" not in door.lacks]
+    assert len(drives) > 10
+    assert [door.name for door in drives if "stop" in door.lacks] == []
+
+
 def test_the_page_has_the_matrix() -> None:
     assert PAGE.read_text() == matrix(), "run `python -m tests.system.contract`"

@@ -1,16 +1,19 @@
 """ROS 2 drives the robot in the same way over both transports, rmw_zenoh and the bridge.
 
 These tests run with an emulated bridge, which has only the Zenoh half, and with the real bridge and
-ROS nodes on DDS. The build of the real bridge takes long, so its tests have the mark `bridge`
-instead of `network`.
+ROS nodes on Cyclone DDS and on Fast DDS. The build of the real bridge takes long, so its tests have
+the mark `bridge` instead of `network`.
 
 `test_ros_rmw.py` and `test_ros_bridge.py` test the protocol of each transport.
 """
 
 from __future__ import annotations
 
+import time
 from collections.abc import Iterator
-from contextlib import ExitStack
+from contextlib import AbstractContextManager, ExitStack, contextmanager
+from pathlib import Path
+from statistics import median
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -18,8 +21,11 @@ import pytest
 
 from tests.promised import TRIGGERS
 from tests.system.builds import BUILD_S
-from tests.system.harness import Bus, Daemon
+from tests.system.bystander import lost
+from tests.system.fast_dds import FastDdsNode
+from tests.system.harness import Bus, Daemon, kept_waiting
 from tests.system.ros_clients import (
+    EMPTY,
     EMPTY_REQUEST,
     JOINTS,
     ODOMETRY,
@@ -52,17 +58,34 @@ CONFIG = QUICK
 EMULATED: dict[str, type[ZenohClient]] = {"rmw": RmwClient, "bridge": BridgeHalf}
 
 NETWORK = [pytest.param(name, marks=pytest.mark.network) for name in EMULATED]
-REAL = pytest.param("real bridge", marks=[pytest.mark.bridge, pytest.mark.timeout(BUILD_S)])
+ON_DDS = [pytest.mark.bridge, pytest.mark.timeout(BUILD_S)]
+CYCLONE, FAST = (pytest.param(name, marks=ON_DDS) for name in ("Cyclone DDS", "Fast DDS"))
 
 
-@pytest.fixture(params=[*NETWORK, REAL])
-def ros(request: pytest.FixtureRequest, bus: Bus) -> Iterator[Client]:
-    """Provide a ROS node for each transport: emulated nodes, and a real one on the real bridge."""
+@contextmanager
+def client(request: pytest.FixtureRequest, bus: Bus, where: Path) -> Iterator[Client]:
     if request.param in EMULATED:
         yield EMULATED[request.param](bus.session)
         return
     domain: DdsDomain = request.getfixturevalue("domain")
-    with domain.node() as node:
+    node: AbstractContextManager[Client] = domain.node()
+    if request.param == "Fast DDS":
+        node = FastDdsNode(request.getfixturevalue("rclpy"), domain.number, where)
+    with node as entered:
+        yield entered
+
+
+@pytest.fixture(params=[*NETWORK, CYCLONE, FAST])
+def ros(request: pytest.FixtureRequest, bus: Bus, tmp_path: Path) -> Iterator[Client]:
+    """Provide a ROS node for each transport: emulated nodes, and real ones on the real bridge."""
+    with client(request, bus, tmp_path) as node:
+        yield node
+
+
+@pytest.fixture(params=[*NETWORK, CYCLONE])
+def caller(request: pytest.FixtureRequest, bus: Bus, tmp_path: Path) -> Iterator[Client]:
+    """Provide each of these nodes whose service calls are answered."""
+    with client(request, bus, tmp_path) as node:
         yield node
 
 
@@ -144,39 +167,73 @@ def test_a_command_by_wildcard_drives_nothing(bus: Bus, zenoh_ros: ZenohClient) 
             bus.get("srv/clear")
 
 
+# stops
+
+STOP_S = 0.05
+"""The longest time from a message on `stop_request` to the published state `stopped`."""
+
+
+def test_each_of_100_messages_on_stop_request_stops_the_robot_at_once(
+    bus: Bus, shared: Daemon, ros: Client
+) -> None:
+    took = []
+    with bus.follow("state") as states:
+        for number in range(101):
+            asked, waited = time.monotonic(), kept_waiting(shared.pid)
+            ros.put("stop_request", EMPTY, EMPTY_REQUEST)
+            state = states.find(lambda s: s["mode"] == "stopped", 5.0, "stopped", after=asked)
+            late = lost(asked, state.at) + kept_waiting(shared.pid) - waited
+            if number:  # the first message waits for its route
+                took.append(state.at - asked - late)
+            numbers = [cause["number"] for cause in state.value["causes"]]
+            assert bus.get("srv/clear", {"numbers": numbers})["success"]
+            bus.comes_to("ready")
+    print(f"stop_request: median {1e3 * median(took):.1f} ms, longest {1e3 * max(took):.1f} ms")
+    assert max(took) < STOP_S
+
+
+@pytest.mark.parametrize("payload", [b"", b"?", bytes(60_000)], ids=["empty", "odd", "large"])
+def test_any_message_on_stop_request_stops(
+    bus: Bus, zenoh_ros: ZenohClient, payload: bytes
+) -> None:
+    key = zenoh_ros.key("stop_request", EMPTY)
+    bus.session.put(key, payload)  # without the attachment of rmw_zenoh
+    bus.comes_to("stopped")
+
+
 # services
 
-EMPTY = (b"\0\1\0\0", EMPTY_REQUEST, b"\0\1\0\0\0\0\0\0")
+EMPTY_FORMS = (b"\0\1\0\0", EMPTY_REQUEST, b"\0\1\0\0\0\0\0\0")
 """The forms of an empty request. Cyclone DDS for Python knows only the second one."""
 
 
 @pytest.mark.parametrize("verb", sorted({*TRIGGERS} - {"clear"}))  # the contract has that
 def test_a_trigger_is_answered_once_for_every_form_of_an_empty_request(
-    bus: Bus, ros: Client, verb: str
+    bus: Bus, caller: Client, verb: str
 ) -> None:
-    for request in EMPTY if isinstance(ros, ZenohClient) else (EMPTY_REQUEST,):
-        called = ros.call(f"acsard/{verb}", TRIGGER, request)
+    for request in EMPTY_FORMS if isinstance(caller, ZenohClient) else (EMPTY_REQUEST,):
+        called = caller.call(f"acsard/{verb}", TRIGGER, request)
         success, message = called.trigger()
         assert success, message
         assert called.seconds < 1.0
 
 
-def call_parameters(ros: Client, service: str, **request: Any) -> Any:
+def call_parameters(caller: Client, service: str, **request: Any) -> Any:
     """Call one of the parameter services of ROS and return its only reply."""
     kind = PARAMETER_SERVICES[service]
     question, answer = REQUESTS[kind]
-    called = ros.call(f"acsard/{service}", kind, encode(make(question, **request)))
+    called = caller.call(f"acsard/{service}", kind, encode(make(question, **request)))
     assert (len(called.replies), called.errors) == (1, 0), called
     return decode(answer, called.replies[0].payload)
 
 
-def test_the_parameters_are_listed_described_and_read(bus: Bus, ros: Client) -> None:
-    names = call_parameters(ros, "list_parameters", prefixes=[], depth=0).result.names
+def test_the_parameters_are_listed_described_and_read(bus: Bus, caller: Client) -> None:
+    names = call_parameters(caller, "list_parameters", prefixes=[], depth=0).result.names
     assert len(names) > 90
     assert "limits.linear_speed" in names
-    described = call_parameters(ros, "describe_parameters", names=names).descriptors
-    types = call_parameters(ros, "get_parameter_types", names=names).types
-    values = call_parameters(ros, "get_parameters", names=names).values
+    described = call_parameters(caller, "describe_parameters", names=names).descriptors
+    types = call_parameters(caller, "get_parameter_types", names=names).types
+    values = call_parameters(caller, "get_parameters", names=names).values
     assert [entry.name for entry in described] == names
     assert [entry.type for entry in described] == list(types) == [entry.type for entry in values]
     (limit,) = (entry for entry in described if entry.name == "limits.linear_speed")
@@ -184,7 +241,7 @@ def test_the_parameters_are_listed_described_and_read(bus: Bus, ros: Client) -> 
     value = values[names.index("limits.linear_speed")].double_value
     assert value == bus.get("config")["limits"]["linear_speed"]
     atomically = call_parameters(
-        ros, "set_parameters_atomically", parameters=[_limit(value)]
+        caller, "set_parameters_atomically", parameters=[_limit(value)]
     ).result
     assert atomically.successful, atomically.reason
 

@@ -13,11 +13,10 @@ import pytest
 from tests.system.harness import Bus, Daemon, running, until
 from tests.system.ros_clients import (
     HASHES,
-    JOINTS,
     PUBLISHED,
     QUICK,
     SERVICES,
-    SPEED_LIMIT,
+    SUBSCRIBED,
     TWIST,
     BridgeHalf,
     RmwClient,
@@ -68,8 +67,7 @@ def announced(zid: str, namespace: str) -> set[str]:
     for name, (kind, depth, late) in PUBLISHED.items():
         qos = f":1:{int(late)}:0,{depth}:typehash=RIHS01_{HASHES[kind]};"
         keys.add(f"{head}/MP/{prefix}{name}/{kind.replace('/', '§')}/{qos}")
-    topics = {"joint_commands": JOINTS, "speed_limit": SPEED_LIMIT}
-    for name, kind in topics.items():
+    for name, kind in SUBSCRIBED.items():
         qos = f":1:0:0,10:typehash=RIHS01_{HASHES[kind]};"
         keys.add(f"{head}/MS/{prefix}{name}/{kind.replace('/', '§')}/{qos}")
     for name, kind in SERVICES.items():

@@ -22,8 +22,8 @@ from tests.system.ros_clients import (
     PUBLISHED,
     QUICK,
     SERVICES,
-    SPEED_LIMIT,
     STAMPED,
+    SUBSCRIBED,
     TF,
     TRIGGER,
     TWIST,
@@ -123,7 +123,7 @@ def test_an_independent_client_stops_and_clears_the_robot(fleet: Fleet) -> None:
 def test_an_independent_client_lists_topics_services_and_the_node(fleet: Fleet) -> None:
     topics = {f"/one/{name}": [kind] for name, (kind, _, _) in PUBLISHED.items()}
     topics |= {f"/one/{name}": [TWIST, STAMPED] for name in TWISTS}
-    topics |= {"/one/joint_commands": [JOINTS], "/one/speed_limit": [SPEED_LIMIT]}
+    topics |= {f"/one/{name}": [kind] for name, kind in SUBSCRIBED.items()}
     services = {f"/one/{name}": [kind] for name, kind in SERVICES.items()}
 
     def lists(what: str, expected: dict[str, list[str]]) -> bool:
@@ -149,8 +149,7 @@ def test_every_liveliness_token_has_the_form_of_rmw_zenoh(bus: Bus, ros: RmwClie
     rows = [("MP", name, *row) for name, row in PUBLISHED.items()]
     rows += [("SS", name, kind, 10, False) for name, kind in SERVICES.items()]
     rows += [("MS", name, kind, 10, False) for name in TWISTS for kind in (TWIST, STAMPED)]
-    rows += [("MS", "joint_commands", JOINTS, 10, False)]
-    rows += [("MS", "speed_limit", SPEED_LIMIT, 10, False)]
+    rows += [("MS", name, kind, 10, False) for name, kind in SUBSCRIBED.items()]
     head, node = f"@ros2_lv/0/{zid}/0", "%/%/acsard"
     expected = {f"{head}/NUMBER/NN/{node}"}
     for role, name, kind, depth, transient in rows:

@@ -16,7 +16,9 @@ import zenoh
 from hypothesis import given
 from hypothesis import strategies as st
 
+from acsard.bus import zenoh_sessions
 from acsard.bus.access_rules import access_control, gateway_access
+from acsard.bus.zenoh_sessions import gateway_session
 from acsard.core.config.settings import (
     AccessConfig,
     CommandsConfig,
@@ -286,6 +288,19 @@ def test_zenoh_accepts_the_rules(
     for rule in access.value["rules"]:
         assert rule["key_exprs"]
         assert len(set(rule["key_exprs"])) == len(rule["key_exprs"])
+
+
+def test_the_gateway_limits_the_rate_of_all_that_a_client_may_put(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(zenoh_sessions, "_opened", lambda settings, endpoints: settings)
+    config = Config(access=AccessConfig(viewers=("v",), operators=("o",), maintainers=("m",)))
+    settings: Any = gateway_session(config)
+    limited = {rule["key_expr"] for table in settings["downsampling"] for rule in table["rules"]}
+    rules = {rule["id"]: rule["key_exprs"] for rule in settings["access_control"]["rules"]}
+    for key in (key for role in ROLES for key in rules.get(f"{role} publishes", ())):
+        assert key in limited, key
+    assert {"acsard/acsar/stop", "stop_request"} <= set(rules["viewer publishes"])
 
 
 def test_the_daemon_may_do_everything_at_the_gateway() -> None:

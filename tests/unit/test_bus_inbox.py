@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+from functools import partial
 from types import SimpleNamespace
 from typing import Any
 
@@ -48,7 +49,7 @@ def arrived(inbox: Inbox, *keys: str) -> None:
             timestamp=None,
             attachment=None,
         )
-        (inbox.on_stop if key == "stop" else inbox.on_sample)(sample)
+        (partial(inbox.on_stop, "native") if key == "stop" else inbox.on_sample)(sample)
 
 
 def an_inbox(rate_hz: float = 100.0) -> tuple[Inbox, Loop]:

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 MESSAGES = """
 nav2_msgs/msg/SpeedLimit: std_msgs/msg/Header header, bool percentage, float64 speed_limit
+std_msgs/msg/Empty: uint8 structure_needs_at_least_one_member
 service_msgs/msg/ServiceEventInfo: \
     uint8 event_type, builtin_interfaces/msg/Time stamp, char[16] client_gid, int64 sequence_number
 rcl_interfaces/msg/FloatingPointRange: float64 from_value, float64 to_value, float64 step

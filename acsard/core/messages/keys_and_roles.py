@@ -105,6 +105,8 @@ IMU = "imu"  # samples of the real or simulated gyro
 
 SPEED_LIMIT = "speed_limit"  # lowers the highest speed, for example by Nav2's speed filter
 
+STOP = "stop"  # any PUT on it stops the robot
+
 # The access rules let a client query only the keys of its role and lower ones, so an answer proves
 # at least the role of the key.
 WHOAMI = "whoami/<role>"
@@ -209,7 +211,7 @@ TOPICS: tuple[Topic, ...] = (
         "lowers the highest speed, m/s or %; 0 ends the limit", publish="operator",
     ),
     Topic(
-        "stop", "in", "anything", "any", "any PUT stops the robot like srv/stop", publish="viewer",
+        STOP, "in", "anything", "any", "any PUT stops the robot like srv/stop", publish="viewer",
     ),
     Topic(
         "gateway", "in", "GatewayState", "4 Hz",

@@ -32,6 +32,8 @@ TYPE_HASHES: dict[str, str] = {
         "RIHS01_7d9a00ff131080897a5ec7e26e315954b8eae3353c3f995c55faf71574000b5b",
     "nav2_msgs/msg/SpeedLimit":
         "RIHS01_83d8e4e842559f4d9a988b19d31b162216ec738536389f98438d1a166f91845a",
+    "std_msgs/msg/Empty":
+        "RIHS01_20b625256f32d5dbc0d04fee44f43c41e51c70d3502f84b4a08e7a9c26a96312",
     "rcl_interfaces/msg/Log":
         "RIHS01_e28ce254ca8abc06abf92773b74602cdbf116ed34fbaf294fb9f81da9f318eac",
     "diagnostic_msgs/msg/DiagnosticArray":

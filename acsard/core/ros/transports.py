@@ -17,6 +17,7 @@ from acsard.core.messages.keys_and_roles import (
     IMU,
     PLAIN_SERVICES,
     SPEED_LIMIT,
+    STOP,
     Direction,
     service_key,
 )
@@ -108,6 +109,10 @@ SOURCES = {
 # The topic of Nav2's speed filter.
 SPEED_LIMIT_TOPIC = RosName(SPEED_LIMIT, SPEED_LIMIT, "in", "nav2_msgs/msg/SpeedLimit")
 
+# Any message stops, so a node stops by its topics where the bridge drops its service calls. The
+# subscription is reliable: a stop that DDS loses is sent again.
+STOP_TOPIC = RosName("stop_request", STOP, "in", "std_msgs/msg/Empty")
+
 # Best effort also receives from drivers with SensorDataQoS.
 GYRO_TOPIC = RosName("imu/data", IMU, "in", "sensor_msgs/msg/Imu", Qos(best_effort=True))
 
@@ -142,6 +147,7 @@ def ros_names(silent: Container[str] = ()) -> tuple[RosName, ...]:
             "sensor_msgs/msg/JointState",
         ),
         SPEED_LIMIT_TOPIC,
+        STOP_TOPIC,
         *(row for row in (GYRO_TOPIC,) if row.native not in silent),
         *(
             RosName(f"{NODE}/{verb}", service_key(verb), "service", "std_srvs/srv/Trigger")
@@ -177,7 +183,13 @@ def node_tokens(ros: RosConfig, zid: str) -> tuple[str, ...]:
 
 def command_keys(ros: RosConfig) -> tuple[str, ...]:
     """Return the Zenoh keys on which commands, speed limits and gyro samples arrive from ROS."""
-    return tuple({e.key: None for e in endpoints(ros, "0") if e.direction == "in"})
+    incoming = (e for e in endpoints(ros, "0") if e.direction == "in" and e.native != STOP)
+    return tuple({e.key: None for e in incoming})
+
+
+def stop_keys(ros: RosConfig) -> tuple[str, ...]:
+    """Return the Zenoh keys on which stops arrive from ROS."""
+    return tuple(e.key for e in endpoints(ros, "0") if e.native == STOP)
 
 
 def announced_publishers(config: Config) -> tuple[tuple[str, str, Transport], ...]:

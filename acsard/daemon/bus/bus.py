@@ -16,7 +16,15 @@ from acsard.bus.zenoh_sessions import daemon_session
 from acsard.core.config.settings import Config
 from acsard.core.incoming.bus_interface import BusHealth, Waker
 from acsard.core.incoming.imu import SIMULATOR_SENDER
-from acsard.core.messages.keys_and_roles import IMU, Topic, full_key, json_key, offered, published
+from acsard.core.messages.keys_and_roles import (
+    IMU,
+    STOP,
+    Topic,
+    full_key,
+    json_key,
+    offered,
+    published,
+)
 from acsard.core.messages.signature import Signature
 from acsard.core.ros.names import gid
 from acsard.core.ros.transports import (
@@ -139,7 +147,9 @@ class ZenohBus:
         for topic in offered(self._config):
             key = full_key(self._id, topic.pattern)
             if topic.direction == "in":
-                received = inbox.on_stop if topic.key == "stop" else inbox.on_sample
+                received = (
+                    partial(inbox.on_stop, "native") if topic.key == STOP else inbox.on_sample
+                )
                 self._entities.append(session.declare_subscriber(key, direct(received)))
             elif topic.key not in ("alive", json_key("<key>")):
                 on_query = direct(partial(inbox.on_query, topic.key))
@@ -166,8 +176,10 @@ class ZenohBus:
         key = endpoint.key
         match endpoint.direction:
             case "in":
-                on_sample = direct(partial(self._inbox.on_ros_sample, endpoint))
-                self._entities.append(session.declare_subscriber(key, on_sample))
+                on_sample = partial(self._inbox.on_ros_sample, endpoint)
+                if endpoint.native == STOP:
+                    on_sample = partial(self._inbox.on_stop, endpoint.transport)
+                self._entities.append(session.declare_subscriber(key, direct(on_sample)))
             case "query" | "service":
                 on_query = direct(partial(self._inbox.on_ros_query, endpoint))
                 # Clients of rmw_zenoh query only complete queryables.

@@ -25,6 +25,7 @@ from acsard.core.messages.keys_and_roles import (
     IMU,
     JSON_TREE,
     SPEED_LIMIT,
+    STOP,
     VERBS,
     is_service,
     service_key,
@@ -138,7 +139,7 @@ QUERY_QUEUE = 256
 # off and names no sender.
 MAX_ATTACHMENT_BYTES = 1024
 
-STOP, SET = service_key("stop"), service_key("set")
+STOP_SERVICE, SET = service_key("stop"), service_key("set")
 
 
 class Inbox:
@@ -228,9 +229,9 @@ class Inbox:
         key = str(sample.key_expr).removeprefix(self._prefix)
         self._arrived(sample, key, str(sample.encoding), "native")
 
-    def on_stop(self, sample: zenoh.Sample) -> None:
-        """Queue a sample of the subscriber to `stop`: a stop, whatever its key expression says."""
-        self._arrived(sample, "stop", str(sample.encoding), "native")
+    def on_stop(self, via: Via, sample: zenoh.Sample) -> None:
+        """Queue a sample of a subscriber to stops: a stop, whatever its key expression says."""
+        self._arrived(sample, STOP, "", via)
 
     def on_ros_sample(self, endpoint: Endpoint, sample: zenoh.Sample) -> None:
         """Queue a ROS sample like one on `endpoint.native`, with the endpoint's encoding."""
@@ -278,7 +279,7 @@ class Inbox:
             received_ns,
             boot_ns,
         )
-        if key == "stop" and put:
+        if key == STOP and put:
             self._stops.put(arrival)
         else:
             self._put(self._buffer(key), arrival)
@@ -352,10 +353,10 @@ class Inbox:
 
     def _queried(self, query: zenoh.Query, topic: str, asked: str, key: str, via: Via) -> None:
         arrived = clock.now()
-        if topic == STOP:
+        if topic == STOP_SERVICE:
             # The stop itself never waits for other queries, and is never refused with `BUSY`.
             by = _bytes(query.attachment, MAX_ATTACHMENT_BYTES)
-            self._stops.put(Arrival("stop", True, b"", "", arrived.mono_ns, None, "", via, by))
+            self._stops.put(Arrival(STOP, True, b"", "", arrived.mono_ns, None, "", via, by))
         ticket = self._replies.issue(query, key)
         if ticket is None:
             return
