@@ -137,9 +137,6 @@ CONTENT_TYPES = {
     ".css": "text/css; charset=utf-8",
     ".svg": "image/svg+xml",
     ".png": "image/png",
-    ".ino": "text/plain; charset=utf-8",
-    ".txt": "text/plain; charset=utf-8",
-    ".zip": "application/zip",
     ".json": "application/json",
     ".webmanifest": "application/manifest+json",
 }

@@ -18,6 +18,13 @@ from acsard.web.answers import CONTENT_TYPES, File
 
 MANUAL = Path(__file__).parents[1] / "manual.zip"
 
+# Those of the files of the repository that the manual carries, too.
+MANUAL_TYPES = CONTENT_TYPES | {
+    ".ino": "text/plain; charset=utf-8",
+    ".txt": "text/plain; charset=utf-8",
+    ".zip": "application/zip",
+}
+
 GZIP_HEAD = b"\x1f\x8b\x08\0\0\0\0\0\0\xff"
 
 MISSING = b"""<!doctype html>
@@ -49,7 +56,7 @@ def manual_files(path: Path = MANUAL) -> dict[str, File]:
 def _load(file: BinaryIO, archive: ZipFile) -> dict[str, File]:
     digests, packed = set[str](), dict[str, tuple[str, str, bytes]]()
     for info in archive.infolist():
-        kind = CONTENT_TYPES.get(PurePosixPath(info.filename).suffix)
+        kind = MANUAL_TYPES.get(PurePosixPath(info.filename).suffix)
         if kind is None or info.compress_type != ZIP_DEFLATED:
             continue
         if info.filename.endswith(".html"):
