@@ -22,7 +22,7 @@ from acsard.cli.common import load
 from acsard.cli.time_range import AFTER_EXAMPLE, TIME_EXAMPLES, TimeError, time_range
 from acsard.core.formatting import json_line, printable
 from acsard.core.values import NS_PER_S, WallNs
-from acsard.host.errors import Exit, ExitError, MendableError, RecordingError, UsageError
+from acsard.host.errors import Exit, ExitError, MendableError, UsageError
 from acsard.host.version import version
 from acsard.recording.directory import is_being_recorded
 from acsard.recording.export import ENDINGS, Kind, export, replacing
@@ -193,9 +193,9 @@ def main_show(args: argparse.Namespace) -> int:
             for entry in timeline.take(record):
                 is_empty = False
                 _print_entry(entry, args.json)
-    _note_damage(recording)
     if is_empty:
-        raise _nothing(args)
+        raise recording.nothing()
+    _note_damage(recording)
     return Exit.OK
 
 
@@ -221,7 +221,7 @@ def main_replay(args: argparse.Namespace) -> int:
         pass
     comparison = playback.comparison
     if head is None or not comparison.steps:
-        raise _nothing(args)
+        raise recording.nothing()
     print(f"{verdict(comparison)}\n{explain_verdict(other is not None)}")
     if head.version != version():
         by = f"acsard {printable(head.version)} recorded this, and acsard {version()} replayed it"
@@ -258,7 +258,7 @@ def main_report(args: argparse.Namespace) -> int:
     recording = _with_progress(args)
     new, head = _new(args, recording, ".html"), recording.head()
     if head is None:
-        raise _nothing(args)
+        raise recording.nothing()
     with _written(new), replacing(new, args.force) as file:
         drawing = Drawing(published(recording, keys=KEYS))
         text = page(drawing, head.robot, [str(damage) for damage in recording.damage])
@@ -335,15 +335,6 @@ def _files(args: argparse.Namespace) -> tuple[Path, list[Path]]:
             f"cannot read {where}: {error.strerror}; name another directory with --directory, or "
             "use sudo",
         ) from None
-
-
-def _nothing(args: argparse.Namespace) -> RecordingError:
-    if args.begin is None and args.end is None:
-        return RecordingError("this recording is empty: the daemon ended within its first second")
-    return RecordingError(
-        "nothing was recorded in that time: correct --from and --to; `acsard recording` lists when "
-        "each recording begins"
-    )
 
 
 def _new(args: argparse.Namespace, recording: Recording, ending: str) -> Path:

@@ -59,7 +59,7 @@ def export(
     with replacing(new, force) as part:
         count = (_write_mcap if kind == "mcap" else _write_csv)(recording, part, other)
         if not count:
-            raise RecordingError("there is nothing to export; correct --from and --to")
+            raise recording.nothing()
         return count
 
 

@@ -339,6 +339,18 @@ class Recording:
         """Return the first head, or None. Raises `RecordingError` as `records`."""
         return next((record for record in self.records() if isinstance(record, Head)), None)
 
+    def nothing(self) -> RecordingError:
+        """Return the error that says why the last `records()` had nothing."""
+        if self.damage:
+            return RecordingError(f"nothing of it can be read: {self.damage[0]}")
+        if (self.begin_ns, self.end_ns) == ALWAYS:
+            text = "this recording is empty: the daemon ended within its first second"
+            return RecordingError(text)
+        return RecordingError(
+            "nothing was recorded in that time: correct --from and --to; `acsard recording` lists "
+            "when each recording begins"
+        )
+
 
 class FrameError(AcsardError):
     """The content of a frame is not that of a recording."""

@@ -117,7 +117,7 @@ def test_only_messages_of_the_time_span_are_written(path: Path, tmp_path: Path) 
 
 
 def test_a_time_span_without_messages_writes_no_file(path: Path, tmp_path: Path) -> None:
-    with pytest.raises(RecordingError, match="nothing to export"):
+    with pytest.raises(RecordingError, match="nothing was recorded in that time"):
         export(part_of(path, 1000.0, 1001.0), tmp_path / "new.mcap", "mcap")
     assert not [*tmp_path.iterdir()]
 

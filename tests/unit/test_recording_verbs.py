@@ -104,6 +104,21 @@ def test_a_file_that_is_no_recording_does_not_hide_the_others(where: Path, tmp_p
     assert name(2) in err
 
 
+@pytest.mark.parametrize("verb", ["show", "replay", "report", "export"])
+def test_a_recording_of_which_nothing_can_be_read_is_not_called_empty(
+    where: Path, tmp_path: Path, verb: str
+) -> None:
+    broken = tmp_path / name(1)
+    data = bytearray((where / name(1)).read_bytes())
+    data[200:210] = bytes(10)
+    broken.write_bytes(data)
+    words = [verb, str(broken), *([str(tmp_path / "new.mcap")] if verb == "export" else [])]
+    result = typed("recording", *words)
+    assert result.code == Exit.FAILURE
+    assert "nothing of it can be read: 000001" in result.err
+    assert "empty" not in result.err
+
+
 def test_recorded_texts_cannot_send_control_characters_to_the_terminal(tmp_path: Path) -> None:
     tape = Tape()
     World(recorder=tape).run(0.3)
