@@ -20,7 +20,8 @@ class Finding(Struct, frozen=True):
     """The result of one step of the check, for example of the test of one motor.
 
     `figure` is the measurement, `text` explains it, and `mend` is the remedy. `keys` are suggested
-    values by dotted key, equal to the configured ones or not.
+    values by dotted key, equal to the configured ones or not. `code` says for programs which of the
+    outcomes of its step it is.
     """
 
     name: str
@@ -29,6 +30,7 @@ class Finding(Struct, frozen=True):
     text: str = ""
     mend: str = ""
     keys: dict[str, object] = {}
+    code: str = ""
 
 
 class StoppedError(AcsardError):

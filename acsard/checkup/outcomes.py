@@ -458,10 +458,11 @@ def find(outcome: str, keys: dict[str, object] | None = None, **values: object) 
     entry = OUTCOMES_BY_NAME[outcome]
     name = str(values.get("name", outcome.partition(":")[0]))
     figure, text, mend = (s.format(**values) for s in (entry.figure, entry.text, entry.mend))
+    code = re.sub(r"\W+", "_", outcome.partition(": ")[2])
     if not entry.unsure:
-        return Finding(name, entry.verdict, figure, text, mend, keys or {})
+        return Finding(name, entry.verdict, figure, text, mend, keys or {}, code)
     margin_s = float(str(values.get("margin_s", 0.0)))
-    return TimingFinding(name, entry.verdict, figure, text, mend, keys or {}, margin_s)
+    return TimingFinding(name, entry.verdict, figure, text, mend, keys or {}, code, margin_s)
 
 
 def plain(finding: Finding) -> Finding:
