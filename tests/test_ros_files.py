@@ -241,7 +241,7 @@ def test_nav2_s_servers_have_time_to_answer_on_a_busy_computer() -> None:
     """With Nav2's own 20 ms the robot drove 3.1 m on a goal that was reported as aborted."""
     timeout_ms = ros_parameters("nav2_params.yaml", "bt_navigator")["default_server_timeout"]
     assert type(timeout_ms) is int, "ROS refuses a double where a node declares an integer"
-    assert timeout_ms >= 200
+    assert timeout_ms >= 1000
 
 
 def test_nav2_py_puts_the_robot_s_values_into_nav2_s_file_and_keeps_the_rest(
@@ -398,6 +398,7 @@ def test_the_bridge_passes_exactly_the_topics_and_services_of_the_daemon() -> No
     }
     assert {kind: set(names) for kind, names in allow.items()} == wanted
     assert all(len(names) == len(set(names)) for names in allow.values())
+    assert bridge_setting("plugins/ros2dds/pub_priorities")[0] == "/stop_request=1:express"
     assert wanted["subscribers"] == {f"/{row.ros}" for row in promised.PUBLISHED if row.ros}
     assert {f"/acsard/{name}" for name in promised.TRIGGERS} < services
 

@@ -521,4 +521,6 @@ def test_one_page_says_how_long_after_an_event_a_goal_under_way_drives_on() -> N
     linked = {name for name, text in words.items() if "nav2.md#a-goal-that-is-under-way" in text}
     behind = ("commands", "emergency-stop", "modes", "restart")
     begun = ("ros-drive", "stop", "trouble")
-    assert linked == {f"howto/{name}" for name in begun} | {f"explanation/{name}" for name in behind}
+    assert linked == {f"howto/{name}" for name in begun} | {
+        f"explanation/{name}" for name in behind
+    }

@@ -390,12 +390,12 @@ class Curl(WebSocket):
 class Example(WebSocket):
     """A program of `deploy/clients` that drives for two seconds through the page.
 
-    It only drives: `stop` uses the same interface of the page.
+    It only drives; `/ws`, which it uses, is a door of its own that stops.
     """
 
     zeroes, speeds = True, (0.2, 0.0)
     lacks: ClassVar = dict.fromkeys(
-        ("clear", "silence", "late", "bad", "set", "state", "role"), "it only drives"
+        ("stop", "clear", "silence", "late", "bad", "set", "state", "role"), "it only drives"
     )
 
     def words(self) -> list[str]:

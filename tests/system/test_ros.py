@@ -23,7 +23,7 @@ from tests.promised import TRIGGERS
 from tests.system.builds import BUILD_S
 from tests.system.bystander import lost
 from tests.system.fast_dds import FastDdsNode
-from tests.system.harness import Bus, Daemon, kept_waiting
+from tests.system.harness import PATIENCE_S, Bus, Daemon, kept_waiting, until
 from tests.system.ros_clients import (
     EMPTY,
     EMPTY_REQUEST,
@@ -198,7 +198,8 @@ def test_any_message_on_stop_request_stops(
 ) -> None:
     key = zenoh_ros.key("stop_request", EMPTY)
     bus.session.put(key, payload)  # without the attachment of rmw_zenoh
-    bus.comes_to("stopped")
+    (cause,) = until(lambda: bus.state()["causes"], PATIENCE_S, "stopped")
+    assert cause["by"] == f"unnamed ({'rmw' if isinstance(zenoh_ros, RmwClient) else 'bridge'})"
 
 
 # services

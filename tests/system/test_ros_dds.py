@@ -16,7 +16,7 @@ import pytest
 from tests.system import fast_dds
 from tests.system.builds import BUILD_S
 from tests.system.fast_dds import FastDdsNode, ros_environment
-from tests.system.harness import ROOT, Bus, Daemon, finish, free_endpoint
+from tests.system.harness import PATIENCE_S, ROOT, Bus, Daemon, finish, free_endpoint, until
 from tests.system.ros_clients import (
     EMPTY,
     EMPTY_REQUEST,
@@ -97,7 +97,7 @@ def test_the_bridge_drops_the_service_calls_of_a_fast_dds_node_and_the_pages_say
         matched = node.do("put", "/stop_request", EMPTY, "", 2.0, best_effort=True)
         assert (matched, "incompatible QoS" in node.program.stderr) == (False, True)
         node.put("stop_request", EMPTY, EMPTY_REQUEST)
-        bus.comes_to("stopped")
+        until(lambda: bus.state()["mode"] == "stopped", PATIENCE_S, "stopped")
     assert DROPPED in (PAGES / "ros-trouble.md").read_text()
 
 

@@ -414,7 +414,7 @@ def caller_name(via: Via, attachment: bytes, stamped_by: str = "") -> str:
     is only a claim: Zenoh does not say on which connection a query arrived.
     """
     if via == "rmw":
-        return f"unnamed (rmw {attachment[-GID_BYTES:].hex()})"
+        return f"unnamed ({' '.join(filter(None, ('rmw', attachment[-GID_BYTES:].hex())))})"
     if via == "bridge":
         return "unnamed (bridge)"
     signed = signature.unpack(attachment)
