@@ -258,7 +258,7 @@ def test_the_fault_of_a_board_whose_speeds_have_jumped_up_and_down_names_the_set
         for speed in (30.0, 0.0):  # one count in a line, or none
             rig.reply = rig.codec.encode(WheelSpeeds(*[speed] * 4))
             rig.step(GO)
-    impossible(rig, 6)
+    impossible(rig, 7)
     assert (rig.mode, rig.out.code) == ("fault", "impossible_speeds")
     assert "with fewer than 400 encoder counts per turn of a wheel, set mcu.enc" in rig.out.reason
 
