@@ -568,7 +568,7 @@ CASES = (
     fault("case 4", "the output was blocked for minutes, and then the robot drives on", SESSION,
           "            self.blocked = True\n", "            self.blocked = False\n"),
     fault("case 5", "an older command after a newer one is obeyed", AGES,
-          "elif not verdict and stamp_ns <= self.accepted_ns:", "elif False:",
+          "if not verdict and stamp_ns <= self.accepted_ns:", "if False:",
           Edit(AGES, "<= (self.beat_ns, self.sequence):", "<= (-1, -1):")),
     fault("case 6", "the guard does not check that a stopped robot comes to rest, and it does not",
           GUARD, "if self._late(now_ns):", "if False:",

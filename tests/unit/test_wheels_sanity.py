@@ -125,6 +125,7 @@ ROWS: dict[str, Row] = {
     "without a time": (10, 1500, lines(10, 10.02, dt=0.0, step=UNKNOWN), ".x"),
     "in 4 ms": (10, 1500, lines(98.17, 98.26, dt=1e-6, step=UNKNOWN), ".x"),
     "in 20 ms": (10, 1500, lines(19.63, 19.66, dt=0.02, step=UNKNOWN), ".x"),
+    "a stall": (25, 1500, [line(39, dt=0.2, step=COARSE), *lines(39, 0, step=COARSE)], "..."),
     "lost lines do not count": (10, 1500, [line(39, dt=0.05, bridged=0.04, step=UNKNOWN)], "."),
 }  # fmt: skip
 

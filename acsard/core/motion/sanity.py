@@ -33,6 +33,8 @@ MAX_WHEEL_ACCELERATION = 1500.0  # rad/s2, more than any real wheel's
 # count of one measurement twice. The counts themselves are at most one more.
 COUNT_MARGIN = 2
 
+INSTANT_S = 0.02  # that a line without counts speaks for: it may report its last instant
+
 CLOCK_S = 0.001  # rounding of the board's clock
 
 NOT_FAST: Wheels4 = (0.0, 0.0, 0.0, 0.0)
@@ -121,7 +123,7 @@ class Sanity(Struct):
         self, line: Line, speeds: Wheels4, fastest: RadPerS, names: tuple[str, ...]
     ) -> str:
         own = line.dt - line.bridged
-        usual = own if own > MIN_COUNT_S else MIN_COUNT_S
+        usual = max(MIN_COUNT_S, min(own, INSTANT_S))
         unknown = line.step == math.inf
         one = line.count or (COARSEST_COUNT if line.step else JUMP_ANGLE)
         most = one if line.by_counts else COUNT_MARGIN * one
