@@ -61,8 +61,10 @@ ROWS: dict[str, Row] = {
     "after a pause": (80, 100, [ten(5), ten(10, dt=0.25), ten(20), ten(0)], "...x"),
     "a damaged first line": (80, 1500, lines(79, 0, 0, 0), ".x.."),
     "a speed that no wheel reaches": (80, 1500, lines(79, 80.9, 80.9, 80.9), ".xxF"),
-    # Two lines that agree are believed: whether they are true shows in the wheels' obedience.
-    "two lines agree": (80, 1500, lines(0, 0, 79, 79, 79), "..x.."),
+    "a jump from what two lines agreed on": (80, 1500, lines(0, 0, 79, 79, 79), "..xxF"),
+    "a burst of lines": (
+        80, 1500, [*lines(10, 10, step=0.0), *lines(17, 10, step=0.0, dt=0.001)], "....",
+    ),
     "lines that agree with no other": (80, 1500, lines(20, 79, -79, -30), ".xxF"),
     "every second line is damaged": (
         80, 1500, lines(0, 79, 0, -60, 0, 35, 0, -79, 0, 60, 0), ".x.x.x.x.x.",

@@ -4,8 +4,9 @@ A line in which a wheel turns, or changes its speed, faster than any wheel can i
 several in a row are a fault. More than one in a hundred is a warning: damage on the wire, or a
 limit in `[feedback]` that is too low. One count in a short time looks like a high speed, so the
 angles decide: what a wheel turns beyond the limit, over all lines, may be one count, or two by the
-speeds alone. A change is impossible only if the line agrees, but for two counts, neither with the
-last possible line nor with the line before it, because a damaged line may look possible.
+speeds alone. A change may be larger by two counts. It counts from the last possible line. Until two
+lines have agreed, it is possible if the line agrees with the one before it: the first line may be
+damaged, and then the true ones look impossible.
 """
 
 from __future__ import annotations
@@ -53,6 +54,7 @@ class Sanity(Struct):
     time: Seconds = 0.0  # of all lines
     possible: Measured | None = None  # the last possible line
     before: Measured | None = None  # the last line
+    trusted: bool = False  # two lines have agreed
     count: int = 0  # of the last impossible lines
     dropped_s: Seconds = 0.0  # their time
     # By how much each wheel turned further than at the limit, rad: the sum over possible lines,
@@ -64,7 +66,7 @@ class Sanity(Struct):
 
     def forget(self) -> None:
         """Start over after a lost link or a cleared fault."""
-        self.count, self.beyond = 0, NOT_FAST
+        self.trusted, self.count, self.beyond = False, 0, NOT_FAST
 
     @property
     def failed(self) -> bool:
@@ -81,7 +83,7 @@ class Sanity(Struct):
         since = since if since > dt else dt
         self.time += since
         if line.gap:
-            self.possible, self.before = None, None
+            self.possible, self.before, self.trusted = None, None, False
             self.beyond, self.dropped_s = NOT_FAST, 0.0
         speeds = line.speeds.as_tuple()
         now = Measured(speeds, self.time - dt / 2)
@@ -93,7 +95,7 @@ class Sanity(Struct):
             step = line.count / MIN_COUNT_S  # the board has an own time for its counts
         if not why and possible is not None and before is not None and line.turned is None:
             sudden = max(map(abs, map(sub, speeds, possible.speeds))) > SPEED_MARGIN
-            if sudden and _jump(now, before, step, names):
+            if sudden and (self.trusted or _jump(now, before, step, names)):
                 why = _jump(now, possible, step, names)
         self.before, self.warning = now, None
         self.lines += 1
@@ -105,6 +107,7 @@ class Sanity(Struct):
             if self.dropped == int(WARNING_FRACTION * WINDOW_LINES) + 1:
                 self.warning = Event("lines_implausible", self._warning_text(why), "warning")
         else:
+            self.trusted = possible is not None
             self.possible, self.count, self.dropped_s = now, 0, 0.0
         if self.lines == WINDOW_LINES:
             self.lines = self.dropped = 0
@@ -155,7 +158,8 @@ class Sanity(Struct):
 
 
 def _jump(now: Measured, then: Measured, step: RadPerS, names: tuple[str, ...]) -> str:
-    most = MAX_WHEEL_ACCELERATION * (now.middle - then.middle) + SPEED_MARGIN + COUNT_MARGIN * step
+    seconds = max(now.middle - then.middle, MIN_COUNT_S)
+    most = MAX_WHEEL_ACCELERATION * seconds + SPEED_MARGIN + COUNT_MARGIN * step
     for name, speed, before in zip(names, now.speeds, then.speeds, strict=False):
         if abs(speed - before) > most:
             leap = f"{name} jumps from {before:.2f} to {speed:.2f} rad/s"
