@@ -48,6 +48,7 @@ WORKS = {
     "doctor": (0, "the running daemon"),
     "call stop": (0, "stopped and latched"),
     "call clear": (0, "cleared"),
+    "move forward 0.02": (0, "yaw"),
     "set": (0, "limits.linear_speed"),
     "set limits.linear_speed 0.4": (0, "limits.linear_speed = 0.4"),
     "recording": (0, "[being recorded]"),

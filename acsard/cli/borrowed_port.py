@@ -12,6 +12,7 @@ from acsard.bus.address import address_of
 from acsard.bus.zenoh_sessions import answers
 from acsard.client.connection import Connection, open_connection
 from acsard.core.config.settings import Config
+from acsard.core.messages.schema import ReplyData
 from acsard.core.values import AcsardError
 from acsard.daemon.serial.blocking import BlockingPort
 from acsard.host import clock
@@ -32,21 +33,22 @@ class Loan:
 
     def __init__(self, config: Config, tell: Callable[[str], None]) -> None:
         self._where, self._port, self._tell = address_of(config), config.mcu.port, tell
-        self._numbers: list[int] = []  # what the daemon latched, then the loan; [] before it
+        self._data = ReplyData()  # what the daemon latched, and the number of the loan
         self.outdated = False  # the daemon's wheels: the file has others now
 
     def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *_: object) -> None:
-        numbers, self._numbers = self._numbers, []
-        if not numbers:
+        data, self._data = self._data, ReplyData()
+        if data.loan is None:
             return
+        numbers = [data.loan] if self.outdated else [*data.numbers, data.loan]
         try:
             with open_connection(self._where) as robot:
                 # It ends the loan even if it is refused: it names no cause of a robot that was off
                 # before, or whose wheels are outdated.
-                reply = robot.call("activate", numbers=numbers[-1:] if self.outdated else numbers)
+                reply = robot.call("activate", numbers=numbers)
         except AcsardError as error:
             self._tell(f"the daemon did not take the port back ({error}): `acsard call activate`")
         else:
@@ -65,7 +67,7 @@ class Loan:
             reply = robot.call("deactivate", release_port=True)
         if not reply.success:
             raise InUseError(f"the daemon keeps {self._port}: {reply.message}")
-        self._numbers = reply.data.numbers
+        self._data = reply.data
         self._tell("the daemon has switched the robot off, and lends the port for this check")
 
     @contextmanager

@@ -144,8 +144,8 @@ stamps
     -> is use_sim_time on, or are the stamps copied from another message? Send the time of the
     command, or no stamp
 too_many_clocks
-    a new sender of {source} is refused, because the commands of 64 others came too late, which the
-    daemon remembers for an hour;
+    a new sender of {source} is refused, because the commands of {note} others came too late, which
+    the daemon remembers for an hour;
     -> check their network, or type `acsard call activate`, which forgets them
 stalled
     the daemon stalled: waiting for the next command of {source}

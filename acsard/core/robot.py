@@ -482,7 +482,8 @@ class Robot:
             news = state.life.mode is not mode or request.verb == "set"
             events.append(Event(request.verb, message, by=request.by, news=news))
         state.request = asked
-        return Answer(request.id, True, message, numbers, changes)
+        loan = state.life.loan if request.release_port else None
+        return Answer(request.id, True, message, numbers, changes, loan)
 
     def _execute(
         self, request: Request, now: Instant, changes: Changes
@@ -538,7 +539,8 @@ class Robot:
             state.life.deactivate(by, now)
             numbers = (state.life.latches.last,)
         state.checks.gyro.rest_s = 0.0
-        return PORT_LENT, (*numbers, state.life.lend())
+        state.life.lend()
+        return PORT_LENT, numbers
 
     @property
     def _at_rest(self) -> bool:

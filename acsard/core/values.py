@@ -221,6 +221,7 @@ class Answer(Struct, frozen=True):
     message: str
     numbers: tuple[int, ...] = ()  # of the causes that were latched or released
     changes: dict[str, tuple[Plain, Plain]] = {}  # old and new value by dotted key
+    loan: int | None = None  # number of the loan of the serial port that began
 
 
 class Refusal(Struct, frozen=True, omit_defaults=True):

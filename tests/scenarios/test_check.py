@@ -218,6 +218,21 @@ def test_a_serial_line_that_echoes_is_never_driven(
     assert world.state.mode == "driving"
 
 
+@four_and_two
+def test_a_line_that_begins_to_echo_in_a_steady_drive_is_found_before_the_command_changes(
+    wheels: WheelMap,
+) -> None:
+    """Every reply repeats a line, and the speeds of the lines do not change."""
+    world = World(Config(mcu=McuConfig(wheels=wheels)))
+    world.run(0.5)
+    world.drive(0.3, seconds=2.0)
+    x = world.state.x
+    world.port.mcu = Echo(world.config, world.now_ns)
+    world.hold(0.3, seconds=1.5)
+    assert (world.state.link, world.state.code) == ("stale", "echo")
+    assert world.state.x - x < 0.4
+
+
 class HalfDuplex(FakeMcu):
     """A board behind an adapter that also returns every line of the daemon to the daemon."""
 
@@ -249,7 +264,9 @@ def test_an_echo_beside_a_board_is_never_driven(period: float, latency_ms: int) 
 
 @pytest.mark.variations(3)
 @pytest.mark.parametrize(
-    ("lag_s", "acceleration"), [(0.001, 1.0), (0.005, 0.2), (0.01, 0.2), (0.01, 1.0), (0.02, 0.2)]
+    # 0.2 m/s2 are 4 rad/s2: the ramps are steeper than `STEEP`.
+    ("lag_s", "acceleration"),
+    [(0.001, 1.0), (0.005, 0.22), (0.01, 0.22), (0.01, 1.0), (0.02, 0.22)],
 )
 @four_and_two
 def test_servo_drives_that_follow_each_ramp_to_the_hundredth_keep_the_link(

@@ -183,7 +183,8 @@ FAULTS = (
     fault("ages full", "a full table of clocks forgets one that it refuses", AGES,
           "return not self.late or now_ns - self.at_ns > MEMORY_NS", "return True",
           Edit(AGES, "(sound[n].least is not None,",
-          "(not sound[n].late, sound[n].least is not None,")),
+          "(not sound[n].late, sound[n].least is not None,"),
+          Edit(AGES, "MAX_CLOCKS = 64", "MAX_CLOCKS = 16")),
     fault("ages rise", "the least delay of a clock rises by 5 % of the time, and without a bound",
           AGES, "RISE_DIVISOR = 2000", "RISE_DIVISOR = 20",
           Edit(AGES, "max(self.least, min(risen, min(self.lows) + timeout_ns))", "risen")),
@@ -441,7 +442,7 @@ FAULTS = (
           "return after_restart(Latches(causes, max([c.number for c in causes], default=0)))"),
     fault("odometry still", "behind a silence the heading of a robot that stands is 0.3 rad off",
           ODOMETRY, "        self.travelled += abs(distance)\n",
-          "        angle += 0.3 if gap and at_rest and gap.unknown > 0.5 else 0.0\n"
+          "        angle += 0.3 if gap and at_rest and gap.seconds + gap.unknown > 0.1 else 0.0\n"
           "        self.travelled += abs(distance)\n"),
     fault("odometry wraps", "x of the pose goes from 1 m to -1 m", ODOMETRY,
           "self.pose = Pose(pose.x + dx, pose.y + dy, yaw)",
@@ -569,7 +570,7 @@ CASES = (
     fault("case 4", "the output was blocked for minutes, and then the robot drives on", SESSION,
           "            self.blocked = True\n", "            self.blocked = False\n"),
     fault("case 5", "an older command after a newer one is obeyed", AGES,
-          "elif not verdict and stamp_ns <= self.accepted_ns:", "elif False:",
+          "if not verdict and stamp_ns <= self.accepted_ns:", "if False:",
           Edit(AGES, "<= (self.beat_ns, self.sequence):", "<= (-1, -1):")),
     fault("case 6", "the guard does not check that a stopped robot comes to rest, and it does not",
           GUARD, "if self._late(now_ns):", "if False:",

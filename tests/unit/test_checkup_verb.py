@@ -124,7 +124,7 @@ def test_a_robot_whose_file_the_check_changed_stays_switched_off(
     robot.__enter__.return_value = robot
     robot.get.return_value = SimpleNamespace(pid=os.getpid(), port="/dev/none")
     robot.call.return_value = schema.ServiceReply(
-        success=True, message="", data=schema.ReplyData(numbers=[7, 8])
+        success=True, message="", data=schema.ReplyData(numbers=[7], loan=8)
     )
     monkeypatch.setattr(borrowed_port, "answers", lambda _: True)
     monkeypatch.setattr(borrowed_port, "is_daemon_here", lambda _: True)

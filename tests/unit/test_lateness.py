@@ -23,13 +23,14 @@ Delay = Callable[[float], float]  # s after the start -> s
 
 
 class Network(Struct):
-    """The delays of both directions, and a step of the sender's clock."""
+    """The delays of both directions, and a step and the resolution of the sender's clock."""
 
     up: Delay
     down: Delay
     loss: float = 0.0
     step_at: float = 0.0
     step: float = 0.0
+    grain: float = 0.0
     seconds: float = 60.0
 
     def journeys(self, dice: random.Random) -> Iterator[tuple[int, float, float, float]]:
@@ -53,7 +54,8 @@ class Network(Struct):
             at += 0.05
 
     def stamp(self, at: float) -> float:
-        return at + (self.step if self.step and at >= self.step_at else 0.0)
+        at += self.step if self.step and at >= self.step_at else 0.0
+        return at // self.grain * self.grain if self.grain else at
 
 
 def _ns(seconds: float) -> Ns:
@@ -299,16 +301,47 @@ def test_a_table_full_of_refused_clocks_refuses_a_new_one_until_it_forgets_them(
     assert sender.hear(3_605_050, 3_605_050, "new") == "unproven"  # an hour later
 
 
-def test_stamps_that_stand_still_for_a_timeout_are_refused_until_two_seconds_later() -> None:
+def test_a_table_of_clocks_that_are_prompt_again_takes_a_new_one() -> None:
+    sender, names = Sender(), [f"clock {number}" for number in range(MAX_CLOCKS)]
+    for at_ms in range(0, 1001, 50):
+        verdicts = [sender.hear(at_ms, at_ms, name) for name in names]
+    assert verdicts == [""] * MAX_CLOCKS
+    assert {sender.hear(5000, 2000, name) for name in names} == {"stale"}
+    assert sender.hear(5050, 5050, names[0]) == ""
+    assert sender.hear(5100, 5100, "new") == "unproven"
+
+
+def test_a_queue_that_arises_during_a_proof_is_remembered() -> None:
+    sender = Sender()
+    assert [sender.hear(50 * n, 50 * n) for n in range(4)] == ["unproven"] * 4
+    assert sender.hear(1000, 200) == "stale"
+    for number in range(2 * MAX_CLOCKS):
+        assert sender.hear(1001 + number, 1001 + number, f"stranger {number}") == "unproven"
+    verdicts = {sender.hear(at_ms, at_ms - 800) for at_ms in range(1200, 8000, 50)}
+    assert "" not in verdicts
+
+
+def test_stamps_that_stand_still_are_refused_and_named_after_two_seconds() -> None:
     sender = Sender(1000)
-    verdicts = [sender.hear(1050 + 50 * n, 1050) for n in range(8)]
-    assert verdicts == ["", *["not_newer"] * 5, *["stamps"] * 2]
-    assert sender.hear(3400, 3400) == "stamps"
-    assert sender.hear(3450, 3450) == ""
-    sender = Sender(1000)  # a network that repeats each command twice is no such clock
+    verdicts = [sender.hear(1050 + 50 * n, 1050) for n in range(50)]
+    assert verdicts[:7] == ["", *["not_newer"] * 5, "stale"]
+    assert set(verdicts[7:41]) == {"stale"}
+    assert set(verdicts[41:]) == {"stamps"}
+    assert sender.hear(3800, 3800) == ""
+    sender = Sender()  # a new clock that stands still is never proven
+    assert "" not in {sender.hear(50 * n, 0) for n in range(50)}
+    sender = Sender(1000)  # a network may repeat each command twice
     for at_ms in range(1050, 4000, 50):
         assert sender.hear(at_ms, at_ms) == ""
         assert [sender.hear(at_ms + late_ms, at_ms) for late_ms in (1, 40)] == ["not_newer"] * 2
+
+
+@each("grain_s", [0.1, 0.5, 1.0, 10.0])
+def test_a_clock_that_advances_in_steps_lets_no_old_command_count(grain_s: float) -> None:
+    dice = random.Random(3)
+    wifi, queue = jitter(dice, 0.004, 0.02), lifted(3.0, 10.0, 1.0, 30.0)
+    network = Network(lambda t: wifi(t) + queue(t), wifi, grain=grain_s)
+    assert play(network, False, dice).oldest <= BOUND_S
 
 
 def test_without_a_stamp_only_the_order_of_the_numbers_counts() -> None:

@@ -12,6 +12,7 @@ from acsard.core.values import (
     BRIDGES,
     REST,
     Announcement,
+    Answer,
     Command,
     Pose,
     Request,
@@ -57,6 +58,12 @@ def test_a_clear_without_a_latch_changes_nothing_and_activate_asks_for_a_zero() 
 REAL = Config(mcu=McuConfig(port="/dev/ttyACM0"))
 
 
+def ends(lent: Answer) -> tuple[int, ...]:
+    """Return the numbers that end this loan and release what it latched."""
+    assert lent.loan is not None
+    return *lent.numbers, lent.loan
+
+
 @each("before", [None, "deactivate", "stop"])
 def test_the_port_is_released_at_rest_and_a_robot_that_was_off_stays_off(
     before: Verb | None,
@@ -66,9 +73,9 @@ def test_the_port_is_released_at_rest_and_a_robot_that_was_off_stays_off(
         rig.answer(before)
     mode = rig.mode
     (answer,) = rig.asked(Request("deactivate", 1, release_port=True)).answers
-    assert (answer.success, len(answer.numbers)) == (True, 1 if before else 2)
+    assert (answer.success, len(answer.numbers)) == (True, 0 if before else 1)
     assert (rig.robot.port_released, rig.mode) == (True, mode if before else "inactive")
-    rig.asked(Request("activate", 2, numbers=answer.numbers))
+    rig.asked(Request("activate", 2, numbers=ends(answer)))
     assert (rig.robot.port_released, rig.mode) == (False, mode)
 
 
@@ -78,7 +85,7 @@ def test_a_robot_may_have_been_pushed_while_another_program_had_the_port() -> No
     (answer,) = rig.asked(Request("deactivate", 1, release_port=True)).answers
     assert "may have been pushed" in answer.message
     rig.unplug().step(ms=4_000)
-    rig.replug().asked(Request("activate", 3, numbers=answer.numbers))
+    rig.replug().asked(Request("activate", 3, numbers=ends(answer)))
     assert rig.linked().out.estimates[-1].covariance.xx == pytest.approx(9.0, rel=0.1)
     rig.asked(Request("reset_odometry", 4))
     rig.run(5)
@@ -102,7 +109,7 @@ def test_while_another_program_has_the_port_no_silence_of_an_input_counts() -> N
     (answer,) = rig.asked(Request("deactivate", 1, release_port=True)).answers
     rig.board(b"").unplug().run(200)
     assert rig.mode == "inactive"
-    rig.replug().asked(Request("activate", 2, numbers=answer.numbers))
+    rig.replug().asked(Request("activate", 2, numbers=ends(answer)))
     rig.linked().run(40)
     assert rig.mode == "ready"
     rig.run(20)  # the board does not report them any more
@@ -161,11 +168,11 @@ def test_neither_a_second_borrower_nor_a_refused_activate_ends_the_loan_of_the_p
     (lent,) = rig.asked(Request("deactivate", 1, release_port=True)).answers
     rig.unplug().run(5)
     (second,) = rig.asked(Request("deactivate", 2, release_port=True)).answers
-    assert (second.success, second.numbers) == (False, ())
+    assert (second.success, second.numbers, second.loan) == (False, (), None)
     assert "lent to another program" in second.message
     (refused,) = rig.asked(Request("activate", 3, numbers=numbers)).answers
     assert (refused.success, rig.robot.port_released) == (False, True)
-    rig.asked(Request("activate", 4, numbers=lent.numbers))
+    rig.asked(Request("activate", 4, numbers=ends(lent)))
     assert (rig.robot.port_released, rig.mode) == (False, mode if before else "waiting")
 
 
@@ -258,7 +265,7 @@ def test_the_fault_of_a_board_whose_speeds_have_jumped_up_and_down_names_the_set
         for speed in (30.0, 0.0):  # one count in a line, or none
             rig.reply = rig.codec.encode(WheelSpeeds(*[speed] * 4))
             rig.step(GO)
-    impossible(rig, 6)
+    impossible(rig, 7)
     assert (rig.mode, rig.out.code) == ("fault", "impossible_speeds")
     assert "with fewer than 400 encoder counts per turn of a wheel, set mcu.enc" in rig.out.reason
 

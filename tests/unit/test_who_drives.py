@@ -10,6 +10,7 @@ from typing import get_args
 from acsard.core.codes import ObjectionCode, Reason, WaitCode
 from acsard.core.config.settings import CommandsConfig, Source
 from acsard.core.link.step_times import StepTimes
+from acsard.core.motion.ages import MAX_CLOCKS
 from acsard.core.motion.arbiter import Arbiter, Choice
 from acsard.core.motion.arbiter_text import (
     MAX_SENDER_LENGTH,
@@ -154,6 +155,15 @@ def test_a_clock_that_was_set_back() -> None:
     for _ in range(60):
         one.wait(50).act("high.a", "zero@5000")
     assert one.status("high").waits_for == Wait("set_back", "high", 5.0)
+
+
+def test_more_clocks_that_came_too_late_than_are_remembered() -> None:
+    one = Commanders(armed=True)
+    for late_ms in (0, 1000):
+        now_ns = one.wait(50).now_ns
+        for number in range(MAX_CLOCKS + late_ms // 1000):
+            one.accept(Command("high", GO, now_ns, now_ns - late_ms * MS, f"clock {number}", "a"))
+    assert one.status("high").waits_for == Wait("too_many_clocks", "high", 0.25, kept="64")
 
 
 def test_a_long_round_trip() -> None:

@@ -249,7 +249,7 @@ def _encoded(reply: ServiceReply, form: Format) -> bytes:
 
 def _data(answer: Answer) -> ReplyData:
     changes = {key: Change(old, new) for key, (old, new) in answer.changes.items()}
-    return ReplyData(list(answer.numbers), changes)
+    return ReplyData(list(answer.numbers), changes, answer.loan)
 
 
 def most_bytes(topic: str) -> int:

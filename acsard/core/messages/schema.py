@@ -622,10 +622,11 @@ class ReplyData(Message, frozen=True):
     """What a service call has changed, for programs."""
 
     numbers: list[CauseNumber] = []
-    """Numbers of the causes that the call has latched or released, as in `RobotState.causes`. The
-    last one of a `deactivate` with `release_port` is that of the loan of the port."""
+    """Numbers of the causes that the call has latched or released, as in `RobotState.causes`."""
     changes: dict[str, Change] = {}
     """The settings that the call has changed, by dotted key."""
+    loan: CauseNumber | None = None
+    """Number of the loan of the serial port by `deactivate` with `release_port`."""
 
 
 class ServiceReply(Message, frozen=True):
@@ -665,9 +666,9 @@ class SwitchOff(Message, frozen=True):
     release_port: bool = False
     """Also lend the serial port to another program, if the robot rests. A robot that is stopped or
     in fault stays so, and only the port is closed. It opens again at the next `activate` that names
-    the number of this loan, or that is not refused; until then, a second program is refused. The
-    borrower may move the robot, so the pose is less certain after it, by up to 10 m and 3.2 rad,
-    until `reset_odometry` or `set_pose`."""
+    the number of this loan (`ReplyData.loan`), or that is not refused; until then, a second program
+    is refused. The borrower may move the robot, so the pose is less certain after it, by up to 10 m
+    and 3.2 rad, until `reset_odometry` or `set_pose`."""
 
 
 class Settings(Message, frozen=True):

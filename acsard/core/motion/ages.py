@@ -36,8 +36,6 @@ LASTING_NS = 2 * NS_PER_S  # refusals for this time are no passing state, and th
 
 SLOWEST, FASTEST = 0.8, 1.25  # stamps that advance by less or more in a second are no clock's
 
-MAX_REPEATED = 3  # commands with one stamp; a network may repeat a command once or twice
-
 # Without an accepted command for this time, a sender is disarmed, and may count from 0 again.
 SILENT_NS = 10 * NS_PER_S
 
@@ -90,10 +88,6 @@ class Clock(Struct):
     """The clock of a sender without an echo."""
 
     at_ns: Ns  # last command
-    stamp_ns: Ns
-    moved_ns: Ns  # first command with this stamp
-    repeated: int = 0  # commands with this stamp since then
-    still_ns: Ns | None = None  # last time when the stamps had stood still for a timeout
     least: int | None = None  # least delay; None until it is proven
     lows: list[int] = []  # lowest `least` of the last slots
     slot_ns: Ns = 0  # begin of the last slot
@@ -107,9 +101,8 @@ class Clock(Struct):
     behind: int = 0  # delay above the least one of the last hour
 
     def judge_stamp(self, at_ns: Ns, stamp_ns: Ns, timeout_ns: Ns) -> AgeVerdict:
-        still = self._stands_still(at_ns, stamp_ns, timeout_ns)
         delay, least = at_ns - stamp_ns, self._risen(at_ns, timeout_ns)
-        self.at_ns, self.stamp_ns, self.least = at_ns, stamp_ns, least
+        self.at_ns, self.least = at_ns, least
         verdict: AgeVerdict
         if least is None or delay < least - MARGIN_NS:
             verdict = self._prove(at_ns, delay, timeout_ns)
@@ -119,9 +112,7 @@ class Clock(Struct):
             if not verdict:  # a late command of another program is no evidence against a proof
                 self.since_ns = None
         self.late = self.late or verdict == "stale"
-        if still:
-            verdict, self.advance = "stamps", 0.0
-        elif not verdict and stamp_ns <= self.accepted_ns:
+        if not verdict and stamp_ns <= self.accepted_ns:
             verdict = "not_newer"
         if verdict:
             return self._lasting(verdict, at_ns, stamp_ns)
@@ -147,21 +138,12 @@ class Clock(Struct):
         fallen = self.low - delay
         if self.since_ns is None or fallen > (at_ns - self.since_ns) // 100 + NS_PER_S // 1000:
             self.low, self.since_ns = delay, at_ns
-        elif -fallen > timeout_ns:
+        elif -fallen >= timeout_ns:  # among others if the stamps stand still
             return "stale"
         elif at_ns - self.since_ns >= timeout_ns:
             self.least, self.since_ns = min(self.low, delay), None
             return ""
         return "unproven" if self.least is None else "early"
-
-    def _stands_still(self, at_ns: Ns, stamp_ns: Ns, timeout_ns: Ns) -> bool:
-        if stamp_ns != self.stamp_ns:
-            self.moved_ns, self.repeated = at_ns, 0
-        else:
-            self.repeated += 1
-            if self.repeated >= MAX_REPEATED and at_ns - self.moved_ns > timeout_ns:
-                self.still_ns = at_ns
-        return self.still_ns is not None and at_ns - self.still_ns <= LASTING_NS
 
     def _lasting(self, verdict: AgeVerdict, at_ns: Ns, stamp_ns: Ns) -> AgeVerdict:
         # Name the cause of refusals that go on: it is looked for again every `LASTING_NS`.
@@ -190,7 +172,7 @@ class Ages(Struct):
         if command.echo is not None or last.beat_ns >= 0:
             verdict = last.judge_echo(command, timeout_ns)
         elif command.stamp_ns is not None:
-            clock = self._clock(command.clock, command.arrived_ns, command.stamp_ns)
+            clock = self._clock(command.clock, command.arrived_ns)
             if clock is None:
                 return "too_many_clocks"
             verdict = clock.judge_stamp(command.arrived_ns, command.stamp_ns, timeout_ns)
@@ -205,7 +187,7 @@ class Ages(Struct):
             last.accept(command)
         return verdict
 
-    def _clock(self, name: str, at_ns: Ns, stamp_ns: Ns) -> Clock | None:
+    def _clock(self, name: str, at_ns: Ns) -> Clock | None:
         clock = self.clocks.get(name)
         if clock is None or at_ns - clock.at_ns > MEMORY_NS:
             if clock is None and len(self.clocks) >= MAX_CLOCKS:
@@ -215,7 +197,7 @@ class Ages(Struct):
                 del self.clocks[
                     min(sound, key=lambda n: (sound[n].least is not None, sound[n].at_ns))
                 ]
-            clock = self.clocks[name] = Clock(at_ns, stamp_ns, at_ns)
+            clock = self.clocks[name] = Clock(at_ns)
         return clock
 
 

@@ -16,7 +16,7 @@ from msgspec import Struct, field
 from acsard.core.codes import AgeCode
 from acsard.core.config.settings import CommandsConfig, Source
 from acsard.core.link.step_times import CATCH_UP_NS
-from acsard.core.motion.ages import MARGIN_NS, SILENT_NS, Ages, Order
+from acsard.core.motion.ages import MARGIN_NS, MAX_CLOCKS, SILENT_NS, Ages, Order
 from acsard.core.motion.neutral import (
     BRIDGE_LEASE_NS,
     FOREVER_NS,
@@ -366,6 +366,8 @@ def _refusal(
         seconds = round(clock.behind / NS_PER_S, 1)
     elif verdict == "stamps" and clock is not None:
         note = f"by {clock.advance:.1f} s in a second" if clock.advance else "they stand still"
+    elif verdict == "too_many_clocks":
+        note = f"{MAX_CLOCKS}"
     return Wait(verdict, settings.name, seconds, kept=note)
 
 

@@ -180,11 +180,10 @@ class Lifecycle(Struct):
         self._use(latched(self.latches, "inactive", why, now.wall_ns, by))
         return "inactive: the robot brakes to rest; `acsard call activate` switches it on again"
 
-    def lend(self) -> int:
-        """Lend the serial port, and return the number of the loan."""
+    def lend(self) -> None:
+        """Lend the serial port; the loan gets a number."""
         self._use(replace(self.latches, last=self.latches.last + 1))
         self.loan = self.latches.last
-        return self.loan
 
     @property
     def port_released(self) -> bool:
