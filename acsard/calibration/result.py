@@ -83,7 +83,13 @@ def calibrate(log: Log, config: Config, source: str) -> Result:
         runs, matches, notes = examined(log.runs, config.drive)
         log = Log(tuple(runs), (*notes, *log.notes))
         _require_one_robot(runs, config, matches)
-        return _require_drive(_result(log, config, source, fit(runs, config, matches)))
+        found = fit(runs, config, matches)
+        if not found.tracked:
+            raise LogError(
+                f"{' and '.join(found.sensors)} show no track, because others fit them as well: "
+                "drive on after each turn on the spot, and drive curves"
+            )
+        return _require_drive(_result(log, config, source, found))
     except LogError as error:
         for note in log.notes:
             error.add_note(note)
@@ -93,7 +99,10 @@ def calibrate(log: Log, config: Config, source: str) -> Result:
 def _require_motion(runs: Sequence[Run]) -> None:
     rolled = sum(float(np.abs(np.diff(side)).sum()) for r in runs for side in (r.left, r.right)) / 2
     if rolled < MIN_ROLLED:
-        raise LogError(f"the wheels roll only {rolled:.1f} rad in this log: {DRIVE}")
+        raise LogError(
+            f"the wheels roll only {rolled:.1f} rad in this log. If the robot drove farther, t is "
+            f"not in s, or the speeds of the wheels are not in rad/s; else {DRIVE}"
+        )
 
 
 def _require_drive(result: Result) -> Result:
@@ -120,8 +129,8 @@ def _require_one_robot(runs: Sequence[Run], config: Config, matches: Mapping[str
         alone[sensor] = fit([without(run, *others) for run in some], config, {sensor: match})
     values = {
         sensor: (found.p[TRACK] - (found.p[LEFT] + found.p[RIGHT]) / 2, found.shares[0])
-        for sensor, found in alone.items()
-    }
+        for sensor, found in alone.items() if found.tracked
+    }  # fmt: skip
     for (a, (track, std)), (b, (other, other_std)) in combinations(values.items(), 2):
         if abs(track - other) > max(CONTRADICTION, CONTRADICTIONS * math.hypot(std, other_std)):
             words = " and ".join(
