@@ -1,9 +1,10 @@
 """Compares each sensor alone with the wheels, and names the mistake that explains a contradiction.
 
 A fit that is better than a wrong configuration is not right. So each sensor of every log is
-compared with the wheels as they are, with the sign of one side turned, and with the turns to the
-other side, on one grid of tracks and delays. The grid also shows the size of the wheels, so wrong
-units and counts show as a robot that cannot be. A cause is named if it leads to a possible robot.
+compared with the wheels as they are, with another scale or sign of one side, and with the turns to
+the other side, on one grid of delays (and of tracks, for positions). The comparison also shows the
+size of the wheels, so wrong units and counts show as a robot that cannot be. A cause is named if it
+leads to a possible robot.
 """
 
 from __future__ import annotations
@@ -52,8 +53,7 @@ BAD, BAD_TURN, BAD_WAY_M, MAX_BAD = 0.9, 0.15, 0.1, 0.4  # of a window that is l
 MARGIN_S = 5.0  # beside a window that is left out
 LEAST_S, LEAST_PART_S = 30.0, 2.0  # of a log of which a part is left out, and of its parts
 STILL, ALONE = 1e-3, 0.2  # of a side that stands, rad in a step, and what the other rolls meanwhile
-UNSIGNED = 0.2  # share that speeds without their signs need not explain
-TWICE, BACKWARDS = 0.02, 1e-3  # shares of the rolled angle
+TWICE, BACKWARDS = 0.02, 1e-3  # share of the rolled angle; rad in a row
 
 NAMES = {"gyro": "yaw_rate", "headings": "yaw", "positions": "x, y"}
 COLUMNS = {
@@ -73,6 +73,11 @@ PLACES = {
     9e-6: DEGREES, 1.3e-5: DEGREES,  # at the equator, and far from it
     1 / 0.3048: "x, y are in ft, not in m", 1 / 0.0254: "x, y are in inches, not in m",
 }  # fmt: skip
+QUESTIONS = {
+    "gyro": "Does yaw_rate turn about the axis that points up?",
+    "headings": "Is yaw the angle about the axis that points up, and no part of a quaternion?",
+    "positions": "Do x and y lie in the floor, and are they positions in one map?",
+}
 SWAPPED = "left and right are swapped, or both have the wrong sign"
 MIRRORED = {
     "gyro": "yaw_rate must grow to the left", "headings": "yaw must grow to the left",
@@ -97,6 +102,7 @@ class Match(Struct, frozen=True):
     unexplained: float  # share of the sensor's motion, without the bad windows
     track: float  # turn by the wheels / by the sensor, as configured; negative to the other side
     delay: Seconds
+    raw: float  # unexplained share with the bad windows, and with turns that only the wheels show
     ratio: float = 1.0  # by which left must be multiplied beside right
     size: float = 1.0  # distance by positions / by the wheels, as configured
     lever: tuple[float, float] = (0.0, 0.0)  # of the sensor, ahead and to the left, m
@@ -114,7 +120,7 @@ class Match(Struct, frozen=True):
 
     @property
     def cost(self) -> float:
-        return float(cost(self.unexplained, self.track if self.given else 0.0, self.delay))
+        return float(cost(self.raw, self.track if self.given else 0.0, self.delay))
 
 
 def cost(share: float | Floats, track: float | Floats, delay: float | Floats) -> Floats:
@@ -131,27 +137,32 @@ def examined(
     """
     base = Base.of(drive)
     matches = {sensor: matched(sensor, runs, base) for sensor in sensors(runs)}
-    if any(not (m.given and m.follows) or m.bad for m in matches.values()):
-        for cause in _facts(runs, matches, base):
-            raise LogError(cause)
+    odd = {s: m for s, m in matches.items() if not (m.given and m.follows) or m.bad}
+    for cause in _facts(runs, odd) if odd else ():
+        raise LogError(cause)
     best = min((match.unexplained for match in matches.values()), default=0.0)
     following = {
         sensor: match for sensor, match in matches.items()
         if match.follows
         and (sensor != "positions" or match.unexplained < max(POOR, POORER * best))
     }  # fmt: skip
-    if causes := [*_turned(following), *_sized(following, drive), *_late(following)]:
+    if causes := [
+        *_turned(following),
+        *_sized(following, drive, _forward(runs)),
+        *_late(following),
+    ]:
         raise LogError(". ".join(causes))
     notes = []
     for sensor, match in matches.items():
         name = NAMES[sensor]
         fact = f"{match.unexplained:.0%} of the motion by {name} is not that of the wheels"
         if not following:
+            if forward := _forward(runs):
+                raise LogError(f"{fact}, and {forward}")
             raise LogError(
                 f"{fact}, and neither swapped sides nor signs, units or delays of up to "
                 f"{WIDE_DELAYS_S[-1]:.0f} s explain it. Is {name} of the same drive, with times "
-                "from the same clock? Did the wheels roll on the floor? Does yaw_rate turn about "
-                "the axis that points up, and do x and y lie in the floor?"
+                f"from the same clock? Did the wheels roll on the floor? {QUESTIONS[sensor]}"
             )
         if sensor not in following:
             others = " and ".join(NAMES[other] for other in following)
@@ -187,15 +198,9 @@ def gyro_bias(runs: Sequence[Run]) -> tuple[float, float]:
         if len(run.gyro_t) > 1:
             t = (run.gyro_t[1:] + run.gyro_t[:-1]) / 2
             rates.append((np.diff(run.turned) / np.diff(run.gyro_t))[run.rests(t)])
-    rest = np.sort(np.concatenate(rates))
-    if len(rest) <= MIN_RESTS:
-        return 0.0, BIAS_STD
-    # Most of the rates may be of a robot that somebody carries: the densest ones are at rest.
-    count = len(rest) // 5
-    first = int(np.argmin(rest[count:] - rest[: len(rest) - count]))
-    middle = float(np.median(rest[first : first + count]))
-    width = rest[first + count] - rest[first]
-    return float(np.median(rest[np.abs(rest - middle) <= 6 * width])), REST_BIAS_STD
+    rest = np.concatenate(rates)
+    known = len(rest) > MIN_RESTS
+    return (float(np.median(rest)), REST_BIAS_STD) if known else (0.0, BIAS_STD)
 
 
 def _without_spans(runs: Sequence[Run], spans: Sequence[Span]) -> tuple[list[Run], list[str]]:
@@ -240,30 +245,17 @@ def matched(sensor: str, runs: Sequence[Run], base: Base) -> Match:
     return replace(best if best.follows else found[0], as_given=found[0].unexplained)
 
 
-def _facts(runs: Sequence[Run], matches: Mapping[str, Match], base: Base) -> Iterator[str]:
+def _facts(runs: Sequence[Run], matches: Mapping[str, Match]) -> Iterator[str]:
     # Causes that the columns of the wheels show, if a sensor contradicts them.
-    names = " and ".join(NAMES[sensor] for sensor, m in matches.items() if not m.given)
-    left, right = (
-        np.concatenate([np.diff(getattr(run, side)) for run in runs]) for side in ("left", "right")
-    )
-    rolled = float(np.abs(left).sum() + np.abs(right).sum())
-    same = np.abs(left - right).sum() < TWICE * rolled
-    back = -float(np.minimum(left, 0.0).sum() + np.minimum(right, 0.0).sum())
-    for sensor in matches:
-        seen = Places(sensor, runs, base) if sensor == "positions" else Turns(sensor, runs, base)
-        if back < BACKWARDS * rolled and seen.unsigned() < UNSIGNED:
-            yield (
-                "the wheels never turn backwards in this log, and only with signs that it does not "
-                f"have they explain {NAMES[sensor]}: encoders with one channel, or a sign that was "
-                "lost. Record speeds with their sign" + (", and not one side twice" if same else "")
-            )
-    if same:
+    names = " and ".join(NAMES[sensor] for sensor in matches)
+    turns = sum(float(np.abs(np.diff(run.right - run.left)).sum()) for run in runs)
+    if turns < TWICE * sum(_rolled(runs, side) for side in ("left", "right")):
         yield (
-            "left and right are the same in every row, although the robot turns: the log has one "
-            "side twice. Record the wheels of both sides"
+            f"left and right are the same in every row, although the robot turns by {names}: the "
+            "log has one side twice. Record the wheels of both sides"
         )
     for side, other in (("left", "right"), ("right", "left")):
-        rolled = sum(float(np.abs(np.diff(getattr(run, other))).sum()) for run in runs)
+        rolled = _rolled(runs, other)
         alone, begin, end = max(_alone(run, side, other) for run in runs)
         if alone > ALONE * rolled:
             yield (
@@ -271,6 +263,22 @@ def _facts(runs: Sequence[Run], matches: Mapping[str, Match], base: Base) -> Ite
                 f"{alone:.0f} of its {rolled:.0f} rad, and {names} contradicts that: is its "
                 "encoder dead, or its cable loose?"
             )
+
+
+def _forward(runs: Sequence[Run]) -> str:
+    sides = [
+        side for side in ("left", "right")
+        if all(np.diff(getattr(run, side)).min() > -BACKWARDS for run in runs)
+    ]  # fmt: skip
+    words = (
+        f"{' and '.join(sides)} never turn backwards in this log. If they did, their encoders have "
+        "one channel, or a sign was lost: record speeds with their sign"
+    )
+    return words if sides else ""
+
+
+def _rolled(runs: Sequence[Run], side: str) -> float:
+    return sum(float(np.abs(np.diff(getattr(run, side))).sum()) for run in runs)
 
 
 def _alone(run: Run, side: str, other: str) -> tuple[float, Seconds, Seconds]:
@@ -313,12 +321,11 @@ def _turned(matches: Mapping[str, Match]) -> Iterator[str]:
         causes = " and ".join(MIRRORED[sensor] for sensor in odd)
         yield f"{fact} it turns to the other side, and they follow {straight}: {causes}"
     else:
-        sources = {"gyro" if sensor == "gyro" else "poses" for sensor in odd}
-        more = [MIRRORED[sensor] for sensor in odd if len(sources) == 1]
-        yield f"{fact} they turn to the other side: {', or '.join((SWAPPED, *more))}"
+        mirrored = " and ".join(MIRRORED[sensor] for sensor in odd)
+        yield f"{fact} they turn to the other side: {SWAPPED}, or {mirrored}"
 
 
-def _sized(matches: Mapping[str, Match], drive: DriveConfig) -> Iterator[str]:
+def _sized(matches: Mapping[str, Match], drive: DriveConfig, other: str) -> Iterator[str]:
     # Tracks and sizes that no robot has, and what would make them possible.
     seen = [
         (s, abs(m.track) * drive.wheel_separation_multiplier, m.size)
@@ -359,6 +366,7 @@ def _sized(matches: Mapping[str, Match], drive: DriveConfig) -> Iterator[str]:
     ]
     yield f"{' and '.join(facts)}: " + (
         ", or ".join(causes)
+        or other
         or "is t in s, are the speeds of the wheels and yaw_rate in rad/s, x "
         "and y in m, and drive.wheel_radius and drive.wheel_separation right?"
     )
@@ -482,30 +490,22 @@ class Turns(Comparison):
         tracks = 1 / np.where(np.abs(mean) > 1e-6, mean, 1e-6)
         moved = np.abs(y - shares[:, -1:] * bias)
         used = known & self.moving
-        least = np.minimum(moved, CAP)
-        share = (used * np.minimum(off, least)).sum(axis=1) / ((used * least).sum(axis=1) + 1e-9)
+        off, most = (np.minimum(values, CAP) * used for values in (off, moved))
+        share = np.minimum(off.sum(axis=1) / (most.sum(axis=1) + 1e-9), 1.0)
         # A step that the delay loses is not explained.
         share = 1 - (1 - share) * used.sum(axis=1) / max(1, int(self.moving.sum()))
         at = int(np.argmin(cost(share, tracks, delays)))
+        track, delay, raw = (float(values[at]) for values in (tracks, delays, share))
         wheels = np.where(self.moving, columns[:-1].T @ shares[at, :-1], 0.0)
         off = np.abs(y[at] - shares[at, -1] * bias - wheels)
         off = np.where(known[at], off, np.minimum(moved[at], BAD_TURN))
         judged, bad = self.judged(self.begin, off, moved[at], self.moving, BAD_TURN)
         ratio = 1.0 if even else float(shares[at, 1] / (shares[at, 0] or 1e-9))
-        return Match(self.sensor, judged, float(tracks[at]), float(delays[at]), ratio, bad=bad)
+        return Match(self.sensor, judged, track, delay, raw, ratio, bad=bad)
 
     def uneven(self) -> list[Match]:
         found = self.match(even=False)
         return [] if SAME_SIZE[0] < found.ratio < SAME_SIZE[1] else [found]
-
-    def unsigned(self) -> float:
-        """Return the share of the turns that the wheels do not explain with any signs."""
-        a, b = self.rolled(self.begin, self.end)
-        seen = self.seen(0.0)
-        used = self.moving & np.isfinite(seen)
-        options = np.array([a + b, a - b, b - a, -a - b])[:, used] / self.base.track
-        off = np.abs(seen[used] - options[:, None] / TRACKS[:, None]).min(axis=0).sum(axis=1)
-        return float(off.min() / np.abs(seen[used]).sum())
 
 
 class Places(Comparison):
@@ -583,15 +583,7 @@ class Places(Comparison):
         if not tracks.min() < track < tracks.max():
             share = max(share, FOLLOWS)  # the best track is none of a robot
         lever = float(ahead), float(aside)
-        return Match(self.sensor, share, track, delay, ratio, float(size), lever, bad)
+        return Match(self.sensor, share, track, delay, raw, ratio, float(size), lever, bad)
 
     def uneven(self) -> list[Match]:
         return [self.match(ratio) for ratio in RATIOS]
-
-    def unsigned(self) -> float:
-        """Return the share of the ways that the wheels do not explain with any signs."""
-        ends = [np.interp(t, self.t, self.place) for t in (self.begin, self.end)]
-        ways = np.abs(ends[1] - ends[0])
-        a, b = self.rolled(self.begin, self.end)
-        off = np.minimum(np.abs(ways - np.abs(a + b) / 2), np.abs(ways - np.abs(a - b) / 2))
-        return float(off.sum() / max(1e-9, ways.sum()))

@@ -16,7 +16,7 @@ import pytest
 from acsard.calibration.log import Log, LogError, read
 from acsard.calibration.result import Result, calibrate
 from acsard.core.config.settings import Config
-from tests.unit.calibration_bags import DRIVE, END
+from tests.unit.calibration_bags import DRIVE, END, motion
 from tests.unit.calibration_faults import (
     FAULTS,
     NOT_SHOWN,
@@ -173,6 +173,9 @@ def on_earth() -> bytes:
     return "\n".join([",".join(rows), *map(",".join, zip(*cells, strict=True)), ""]).encode()
 
 
+SPOT = motion([(3, 0, 0), *[(8, 0, w) for w in (0.8, -0.8, 1.2, -1.2)] * 2, (4, 0.3, 0), (3, 0, 0)])
+
+
 def angles(factor: float, names: tuple[str, ...] = GYRO) -> bytes:
     return csv(times(factor, "left", "right")(sound(3, names, angles=True)))
 
@@ -229,6 +232,8 @@ CAUSES: dict[str, tuple[Callable[[], bytes], str]] = {
     "turns/s": (lambda: changed(BOTH, 3, times(0.5 / np.pi, "left", "right")), "in turns/s"),
     "longitude and latitude": (on_earth, "degrees of longitude and latitude"),
     "left x 2": (lambda: changed(GYRO, 3, times(2.0, "left")), "multiplied by 0.5: has one side"),
+    "left x 1.4, hardly straight": (
+        lambda: csv(times(1.4, "left")(sound(3, GYRO, SPOT))), "multiplied by 0.71: has one side"),
     "right x 4": (lambda: changed(BOTH, 3, times(4.0, "right")), "multiplied by 4: has one side"),
     "left in rpm": (lambda: changed(GYRO, 3, times(9.549, "left")), "multiplied by 0.1: has one"),
     "IMUs in pairs": (lambda: changed(GYRO, 2, lambda r: groups(r, 2, 4)), f"yaw_rate, {MIXED}"),
