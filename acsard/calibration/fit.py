@@ -40,6 +40,7 @@ PIECES = 12  # at least
 # A drive by positions alone that is fitted whole. With 12 pieces of 55 s, its path has 2.6 times
 # the least error (mean of 6 robots). Longer ones with turns on the spot are worse as a whole.
 WHOLE_S = 60.0
+MIN_RUNS = 3  # of which each is left out whole, and not a part of it, for the deviations
 FARTHEST = 3.0  # deviations of the prior, by which a piece that is left out moves a parameter
 
 SURE = 2.0  # standard deviations by which the new values must be better, or else by half
@@ -225,9 +226,14 @@ class Problem:
         # single piece shows, and the inverse information that a robot skids for a whole piece. The
         # prior is in the second one.
         scale = np.diag(found.scale)
-        # A reading by tape has its deviation, and may be the only one of its kind.
-        sensed = found.left_out[[not piece.run.tape for piece in self.pieces]][:, self.free]
-        apart, n = sensed - sensed.sum(axis=0) / max(1, len(sensed)), max(1, len(sensed))
+        # A reading by tape has its deviation, and may be the only one of its kind. Parts of one run
+        # share what it errs by, so runs are left out whole, if there are some.
+        names = [piece.run.name if not piece.run.tape else "" for piece in self.pieces]
+        if len(set(names) - {""}) < MIN_RUNS:
+            names = [name and str(n) for n, name in enumerate(names)]
+        groups = np.array(sorted(set(names) - {""}))[:, None] == np.array(names)
+        left_out = np.array([found.without(group)[self.free] for group in groups])
+        apart, n = left_out - left_out.sum(axis=0) / max(1, len(groups)), max(1, len(groups))
         jackknife = apart.T @ apart * (n - 1) / n
         return np.asarray(
             (jackknife + scale @ np.linalg.inv(found.whole) @ scale)[GEOMETRY, GEOMETRY]

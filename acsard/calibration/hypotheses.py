@@ -44,7 +44,6 @@ FOLLOWS = 0.3  # share of a sensor's motion that the wheels need not explain
 POOR, POORER = 0.15, 3.0  # share, and in that of the best sensor, of one that is left out
 # A row that is not the given one with a possible robot must leave less than half unexplained.
 CLEARER, CLEAR = 2.0, 0.02
-TOO_GOOD = 2e-3
 ROBOTS, USUAL_ROBOTS = (0.8, 3.6), (0.8, 2.8)  # effective track / wheel separation
 SIZES, SAME_SIZE = (0.8, 1.25), (0.8, 1.25)  # distance by positions / by the wheels
 SAME_SIGN = 0.25  # of a ratio of -1
@@ -168,11 +167,6 @@ def examined(
             others = " and ".join(NAMES[other] for other in following)
             notes.append(f"{name} is left out: {fact}, but {others} follows them")
             runs = [without(run, sensor) for run in runs]
-        elif match.unexplained < TOO_GOOD:
-            notes.append(
-                f"{name} agrees with the wheels better than a sensor can: was it computed from "
-                "them? (The true pose of the simulator agrees, too.)"
-            )
         if sensor in following and abs(match.delay) > NOTED_LATE_S:
             notes.append(f"the times of {name} are {1000 * match.delay:.0f} ms after the wheels'")
     kept, more = _without_spans(runs, sorted({span for m in following.values() for span in m.bad}))
@@ -579,7 +573,6 @@ class Places(Comparison):
                                      / np.bincount(self.part))[self.part])  # fmt: skip
         rolls = self.rolls(self.t - STEP_S / 2, self.t + STEP_S / 2)
         share, bad = self.judged(self.t, off - self.noise, moved, rolls, BAD_WAY_M)
-        share = max(share, min(raw, TOO_GOOD))  # the noise does not hide that it is too good
         if not tracks.min() < track < tracks.max():
             share = max(share, FOLLOWS)  # the best track is none of a robot
         lever = float(ahead), float(aside)

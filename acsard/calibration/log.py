@@ -54,6 +54,8 @@ NEAR_SHARE, FAR_SHARES = 0.1, 3.0  # of the range of the values
 FAR_STEPS = 5.0  # of the usual step of positions
 MAX_APART, STEPS = 0.2, 1.5  # share of the moving values; steps of a coarse encoder
 
+STUCK_S, STUCK_TURN = 1.0, 0.3  # a gyro that repeats one value while the wheels' turn changes, rad
+
 MAX_BYTES = 1 << 30  # a file is read into memory
 
 TAPE_STD_M = 0.01  # of a distance, with the choice of the point on the robot
@@ -434,7 +436,7 @@ def run_of(name: str, streams: Mapping[str, tuple[Floats, ...]], notes: Notes) -
     wild = apart("x, y", place_t, run.place)
     notes.add("rows of x, y left out, far from those beside them: {}", int(wild.sum()))
     run = replace(run, place_t=run.place_t[~wild], place=run.place[~wild])
-    return _without_repeats(notes, run)
+    return _without_repeats(notes, _without_stuck(notes, run, rate))
 
 
 def integral(t: Floats, values: Floats) -> Floats:
@@ -442,6 +444,27 @@ def integral(t: Floats, values: Floats) -> Floats:
     if not len(t):
         return np.zeros(0)
     return np.concatenate(([0.0], np.cumsum((values[1:] + values[:-1]) / 2 * np.diff(t))))
+
+
+def _without_stuck(notes: Notes, run: Run, rate: Floats) -> Run:
+    # Leave out a gyro that repeats one value to the last digit while the wheels' turn changes.
+    if len(rate) < 2:
+        return run
+    begins = np.concatenate(([0], np.flatnonzero(np.diff(rate)) + 1))
+    ends = np.concatenate((begins[1:], [len(rate)])) - 1
+    long = run.gyro_t[ends] - run.gyro_t[begins] > STUCK_S
+    kept = np.ones(len(rate), dtype=bool)
+    for begin, end in zip(begins[long], ends[long], strict=True):
+        t = np.arange(run.gyro_t[begin], run.gyro_t[end], REST_S)
+        turn = np.diff(np.interp(t, run.t, run.right) - np.interp(t, run.t, run.left))
+        if len(turn) and np.ptp(turn) > STUCK_TURN:
+            kept[begin : end + 1] = False
+            notes.add(
+                f"yaw_rate repeats {rate[begin]:g} exactly from {run.gyro_t[begin]:.0f} s to "
+                f"{run.gyro_t[end]:.0f} s of run {run.name or 1} ({end - begin + 1} samples), "
+                "although the turn of the wheels changes: the gyro hung, and this part is left out"
+            )
+    return replace(run, gyro_t=run.gyro_t[kept], turned=run.turned[kept])
 
 
 def _without_repeats(notes: Notes, run: Run) -> Run:

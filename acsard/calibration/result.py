@@ -29,6 +29,7 @@ from acsard.terminal.output import table
 MAX_SPEED, MAX_TURNS = 10.0, 1000.0  # m/s, 360 deg
 CONTRADICTION, CONTRADICTIONS = 0.1, 4.0  # of two tracks, as a fraction and in deviations
 ALONE_RUNS = 40  # of many runs, these suffice to compare the tracks by two sensors
+EXACT_TURN, EXACT_M = 3e-4 * math.tau, 3e-4  # errors below those of a sensor: of a turn, rad; m
 MIN_ROLLED = 20.0  # rad, by the wheels of a log
 DRIVE = (
     "stand for 3 s, drive 2 m ahead and back, turn three times to each side, slowly and fast, then "
@@ -89,11 +90,22 @@ def calibrate(log: Log, config: Config, source: str) -> Result:
                 f"{' and '.join(found.sensors)} show no track, because others fit them as well: "
                 "drive on after each turn on the spot, and drive curves"
             )
+        log = Log(log.runs, (*_too_good(found), *log.notes))
         return _require_drive(_result(log, config, source, found))
     except LogError as error:
         for note in log.notes:
             error.add_note(note)
         raise
+
+
+def _too_good(found: Fit) -> Iterator[str]:
+    turns = next((NAMES[sensor] for sensor in found.sensors if sensor in ("gyro", "headings")), "")
+    for name, errors, least in ((turns, found.turn, EXACT_TURN), ("x, y", found.place, EXACT_M)):
+        if errors and errors.new < least:
+            yield (
+                f"{name} agrees with the wheels better than a sensor can: was it computed from "
+                "them? (The true pose of the simulator agrees, too.)"
+            )
 
 
 def _require_motion(runs: Sequence[Run]) -> None:

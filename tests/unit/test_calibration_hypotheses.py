@@ -13,7 +13,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from acsard.calibration.log import Log, LogError, read
+from acsard.calibration.geometry import path
+from acsard.calibration.log import Log, LogError, Notes, read, run_of
 from acsard.calibration.result import Result, calibrate
 from acsard.core.config.settings import Config
 from tests.unit.calibration_bags import DRIVE, END, motion
@@ -298,6 +299,11 @@ def test_a_sensor_that_was_computed_from_the_wheels_is_noted() -> None:
     notes = calibrate(log, Config(), "a.csv").notes
     assert any("yaw_rate agrees with the wheels better than a sensor can" in n for n in notes)
     assert notes[-1] == "a note"
+    where, _ = path((trip.left + trip.right) * 0.025 * 0.01, rate * 0.01)
+    streams = {"left right": (trip.t, trip.left, trip.right),
+               "x y": (trip.t[::5], where.real[:-1:5], where.imag[:-1:5])}  # fmt: skip
+    notes = calibrate(Log((run_of("1", streams, Notes()),), ()), Config(), "a.csv").notes
+    assert any("x, y agrees with the wheels better than a sensor can" in n for n in notes)
 
 
 def test_wheels_that_hardly_roll_are_refused() -> None:
