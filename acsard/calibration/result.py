@@ -175,8 +175,11 @@ def _result(log: Log, config: Config, source: str, found: Fit) -> Result:
     decisions += _response(log, config, settings)
     if not settings:
         off = np.abs(found.p[[LEFT, RIGHT, TRACK]])
-        agrees = (found.readings is None or found.readings.now <= AGREES) and bool(
-            np.all(off < np.maximum(AGREES * np.sqrt(np.diag(found.covariance)), SMALL))
+        exact = any(_too_good(found))
+        agrees = (
+            not exact
+            and (found.readings is None or found.readings.now <= AGREES)
+            and bool(np.all(off < np.maximum(AGREES * np.sqrt(np.diag(found.covariance)), SMALL)))
         )
         verdict = (
             "Your robot agrees with its configuration" if agrees else "No value is surely better"

@@ -16,7 +16,7 @@ import pytest
 from acsard.calibration.geometry import path
 from acsard.calibration.log import Log, LogError, Notes, read, run_of
 from acsard.calibration.result import Result, calibrate
-from acsard.core.config.settings import Config
+from acsard.core.config.settings import Config, DriveConfig
 from tests.unit.calibration_bags import DRIVE, END, motion
 from tests.unit.calibration_faults import (
     FAULTS,
@@ -304,6 +304,9 @@ def test_a_sensor_that_was_computed_from_the_wheels_is_noted() -> None:
                "x y": (trip.t[::5], where.real[:-1:5], where.imag[:-1:5])}  # fmt: skip
     notes = calibrate(Log((run_of("1", streams, Notes()),), ()), Config(), "a.csv").notes
     assert any("x, y agrees with the wheels better than a sensor can" in n for n in notes)
+    agreeing = Config(drive=DriveConfig(wheel_separation_multiplier=1.5))
+    with pytest.raises(LogError, match="No value is surely better"):
+        calibrate(Log((run_of("1", streams, Notes()),), ()), agreeing, "a.csv")
 
 
 def test_wheels_that_hardly_roll_are_refused() -> None:
