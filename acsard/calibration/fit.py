@@ -9,7 +9,7 @@ cut). The errors on the runs that were left out decide whether the new values ar
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from itertools import pairwise
 
 import numpy as np
@@ -40,11 +40,13 @@ PIECES = 12  # at least
 # A drive by positions alone that is fitted whole. With 12 pieces of 55 s, its path has 2.6 times
 # the least error (mean of 6 robots). Longer ones with turns on the spot are worse as a whole.
 WHOLE_S = 60.0
+MIN_RUNS = 3  # of which each is left out whole, and not a part of it, for the deviations
 FARTHEST = 3.0  # deviations of the prior, by which a piece that is left out moves a parameter
 
 SURE = 2.0  # standard deviations by which the new values must be better, or else by half
 CAP = 10.0  # robust standard deviations: a residual of a run that was left out counts as at most
 AGREES = 2.0  # deviations of a reading by tape
+OTHER_TRACK, SHOWN = 0.4, 1.1  # a log that shows its track fits others worse, by this factor
 WORSE = 0.02  # by which the error of one sensor may grow, as a fraction
 
 SENSORS = "gyro", "positions", "headings", "tape"
@@ -224,9 +226,14 @@ class Problem:
         # single piece shows, and the inverse information that a robot skids for a whole piece. The
         # prior is in the second one.
         scale = np.diag(found.scale)
-        # A reading by tape has its deviation, and may be the only one of its kind.
-        sensed = found.left_out[[not piece.run.tape for piece in self.pieces]][:, self.free]
-        apart, n = sensed - sensed.sum(axis=0) / max(1, len(sensed)), max(1, len(sensed))
+        # A reading by tape has its deviation, and may be the only one of its kind. Parts of one run
+        # share what it errs by, so runs are left out whole, if there are some.
+        names = [piece.run.name if not piece.run.tape else "" for piece in self.pieces]
+        if len(set(names) - {""}) < MIN_RUNS:
+            names = [name and str(n) for n, name in enumerate(names)]
+        groups = np.array(sorted(set(names) - {""}))[:, None] == np.array(names)
+        left_out = np.array([found.without(group)[self.free] for group in groups])
+        apart, n = left_out - left_out.sum(axis=0) / max(1, len(groups)), max(1, len(groups))
         jackknife = apart.T @ apart * (n - 1) / n
         return np.asarray(
             (jackknife + scale @ np.linalg.inv(found.whole) @ scale)[GEOMETRY, GEOMETRY]
@@ -303,6 +310,7 @@ class Fit(Struct, frozen=True):
     place: Errors | None  # rms of the positions, m
     readings: Errors | None  # rms of a person's readings, in their deviations
     sized: bool  # the log shows the size of the wheels, not only their ratio
+    tracked: bool  # the log shows the track: another one fits it worse
 
     @property
     def better(self) -> bool:
@@ -316,7 +324,7 @@ class Fit(Struct, frozen=True):
         return np.asarray(np.sqrt(np.einsum("ri,ij,rj->r", rows, self.covariance, rows)))
 
 
-def fit(runs: Sequence[Run], config: Config, matches: Mapping[str, Match] | None = None) -> Fit:
+def fit(runs: Sequence[Run], config: Config, matches: dict[str, Match] | None = None) -> Fit:
     """Fit the geometry. Raises `LogError` if the wheels never move beside a sensor."""
     base, (bias, bias_std) = Base.of(config.drive), gyro_bias(runs)
     if matches is None:
@@ -343,14 +351,15 @@ def fit(runs: Sequence[Run], config: Config, matches: Mapping[str, Match] | None
     return _judged(problem, solution, base)
 
 
-def _start(problem: Problem, matches: Mapping[str, Match]) -> Floats:
+def _start(problem: Problem, matches: dict[str, Match]) -> Floats:
     p = problem.mean.copy()
-    for sensor, match in matches.items():
+    # Turns show the track, if there are any, and positions the size.
+    for sensor, match in reversed(matches.items()):
         delay = GYRO_DELAY if sensor == "gyro" else POSE_DELAY
         p[delay] = problem.mean[delay] = match.delay
         p[AHEAD : ASIDE + 1] += match.lever
-        p[LEFT:TRACK] = math.log(abs(match.size) + 1e-9)
-        p[TRACK] = math.log(abs(match.track * match.size) + 1e-9)
+        p[LEFT:TRACK] += math.log(abs(match.size) + 1e-9)
+        p[TRACK] = math.log(abs(match.track) + 1e-9) + p[LEFT]
     turns = [
         (piece.base.motion(p, *piece.rolls)[1].sum() / reading.value)
         for piece in problem.pieces for reading in piece.run.tape
@@ -397,8 +406,18 @@ def _judged(problem: Problem, solution: Solution, base: Base) -> Fit:
         base, solution.p, solution.covariance, tuple(problem.sensors), tuple(problem.pieces),
         solution.without, float(gain.sum()), spread, float(gain.min()), turn,
         errors.get("positions"), errors.get("tape"),
-        bool({"positions", "tape"} & set(problem.sensors)),
+        bool({"positions", "tape"} & set(problem.sensors)), _tracked(problem, solution.p),
     )  # fmt: skip
+
+
+def _tracked(problem: Problem, p: Floats) -> bool:
+    best = problem.sizes(p)
+    moved = np.repeat(p[None], 2, axis=0)
+    moved[:, TRACK] += OTHER_TRACK, -OTHER_TRACK
+    return "tape" in problem.sensors or all(
+        any(size > SHOWN * best[sensor] for sensor, size in problem.sizes(other).items())
+        for other in moved
+    )
 
 
 def _heading_error(piece: Piece, p: Floats) -> float:

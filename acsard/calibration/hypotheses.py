@@ -1,16 +1,16 @@
 """Compares each sensor alone with the wheels, and names the mistake that explains a contradiction.
 
 A fit that is better than a wrong configuration is not right. So each sensor of every log is
-compared with the wheels as they are, with the sign of one side turned, and with the turns to the
-other side, on one grid of tracks and delays. The grid also shows the size of the wheels, so wrong
-units and counts show as a robot that cannot be. A cause is named if it leads to a possible robot.
+compared with the wheels as they are, with another scale or sign of one side, and with the turns to
+the other side, on one grid of delays (and of tracks, for positions). The comparison also shows the
+size of the wheels, so wrong units and counts show as a robot that cannot be. A cause is named if it
+leads to a possible robot.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from itertools import product
 
 import numpy as np
 import numpy.typing as npt
@@ -25,35 +25,34 @@ from acsard.core.values import Seconds
 STEP_S, WINDOW_S, GRID_S = 1.0, 10.0, 0.05  # of turns, of positions, and of the wheels' path
 MAX_SPOTS, SEARCH_S = 2000, 200.0  # positions that are compared, and parts that are searched
 APART_S = 60.0  # between two runs on their common axis of time
-MIN_ROLL, MIN_TURN, MIN_STEPS = 0.02, 0.05, 3  # rad, in a step that shows something
+MIN_ROLL, LEAST_TURN = 0.02, 1e-3  # rad, in a step that shows something
 HUBER = 1.5  # robust standard deviations, beyond which a position counts less
 BIAS_STD, REST_BIAS_STD, MIN_RESTS = 0.05, 1e-3, 20  # rad/s, of a gyro without and with rests
 CAP = 0.5  # rad, beyond which a turn counts as not explained
 HOLE_S, HOLE_PERIODS = 0.5, 8.0  # a hole in the samples of a sensor is longer than both
 LEVER = 1e-3  # weight of the lever of a sensor, which is small
 
-TRACKS = np.geomspace(0.3, 4.0, 66)  # of the configured one
-WIDE_TRACKS = np.geomspace(0.01, 1000.0, 200)
-FINE, QUANTILES = np.linspace(0.95, 1.05, 21), np.linspace(0.02, 0.98, 49)
+TRACKS, WIDE_TRACKS = (np.geomspace(*span, 66) for span in ((0.3, 4.0), (0.01, 1000.0)))
+FINE = np.linspace(0.95, 1.05, 21)  # of the best track
 DELAYS_S, WIDE_DELAYS_S = np.linspace(-1.0, 1.0, 21), np.linspace(-8.0, 8.0, 65)
 DELAY_COST = 1e-3  # for each second: of equal delays, the least one counts
 LATE_S, NOTED_LATE_S = 0.9, 0.1
+RATIOS = -1.0, 2.0, 0.5, 4.0, 0.25  # of the left side, that positions are compared with
+ROUNDS = 12  # of the weights of the least absolute values
 
 FOLLOWS = 0.3  # share of a sensor's motion that the wheels need not explain
 POOR, POORER = 0.15, 3.0  # share, and in that of the best sensor, of one that is left out
-ALIAS = 0.02  # share, by which a possible robot may explain less than an impossible one
-CLEARER, CLEAR = 0.5, 0.01  # of the unexplained share: factor and margin of a better row
-TOO_GOOD = 2e-3
-LEAST_TRACK = 1e-3
+# A row that is not the given one with a possible robot must leave less than half unexplained.
+CLEARER, CLEAR = 2.0, 0.02
 ROBOTS, USUAL_ROBOTS = (0.8, 3.6), (0.8, 2.8)  # effective track / wheel separation
 SIZES, SAME_SIZE = (0.8, 1.25), (0.8, 1.25)  # distance by positions / by the wheels
+SAME_SIGN = 0.25  # of a ratio of -1
 
-BAD, BAD_TURN, BAD_WAY_M, MAX_BAD = 0.9, 0.15, 0.3, 0.4  # of a window that is left out
+BAD, BAD_TURN, BAD_WAY_M, MAX_BAD = 0.9, 0.15, 0.1, 0.4  # of a window that is left out
 MARGIN_S = 5.0  # beside a window that is left out
 LEAST_S, LEAST_PART_S = 30.0, 2.0  # of a log of which a part is left out, and of its parts
 STILL, ALONE = 1e-3, 0.2  # of a side that stands, rad in a step, and what the other rolls meanwhile
-UNSIGNED = 0.2  # share that speeds without their signs need not explain
-TWICE, BACKWARDS = 0.02, 1e-3  # shares of the rolled angle
+TWICE, BACKWARDS = 0.02, 1e-3  # share of the rolled angle; rad in a row
 
 NAMES = {"gyro": "yaw_rate", "headings": "yaw", "positions": "x, y"}
 COLUMNS = {
@@ -67,21 +66,29 @@ SPEEDS = {
     2.0: COUNTS.format("twice") + ", or drive.wheel_radius, if that is the diameter",
     0.5: COUNTS.format("half of"), 0.25: COUNTS.format("a quarter of"),
 }  # fmt: skip
+DEGREES = "x, y are degrees of longitude and latitude: convert them to m to the east and north"
 PLACES = {
     100.0: "x, y are in cm, not in m", 1000.0: "x, y are in mm, not in m",
+    9e-6: DEGREES, 1.3e-5: DEGREES,  # at the equator, and far from it
     1 / 0.3048: "x, y are in ft, not in m", 1 / 0.0254: "x, y are in inches, not in m",
 }  # fmt: skip
+QUESTIONS = {
+    "gyro": "Does yaw_rate turn about the axis that points up?",
+    "headings": "Is yaw the angle about the axis that points up, and no part of a quaternion?",
+    "positions": "Do x and y lie in the floor, and are they positions in one map?",
+}
 SWAPPED = "left and right are swapped, or both have the wrong sign"
 MIRRORED = {
     "gyro": "yaw_rate must grow to the left", "headings": "yaw must grow to the left",
     "positions": "x, y are mirrored: y must point to the left of x",
 }  # fmt: skip
 
-SIDES: dict[str, Callable[[Run], tuple[Floats, Floats]]] = {
-    "given": lambda run: (run.left, run.right),
-    "one sign": lambda run: (-run.left, run.right),
-    # If the columns are angles, the angle is what was integrated.
-    "angles": lambda run: (np.gradient(run.left, run.t), np.gradient(run.right, run.t)),
+# Other meanings of the columns. If they are angles, the angle is what was integrated.
+ROWS: dict[str, Callable[[Run], Run]] = {
+    "angles": lambda run: replace(
+        run, left=np.gradient(run.left, run.t), right=np.gradient(run.right, run.t)
+    ),
+    "degrees": lambda run: replace(run, yaw=np.radians(run.yaw)),
 }
 
 Span = tuple[int, Seconds, Seconds]  # a part of a log: index of the run, begin and end
@@ -91,13 +98,15 @@ class Match(Struct, frozen=True):
     """What a sensor shows of the wheels, if one row of the table is right."""
 
     sensor: str
-    sides: str  # a key of SIDES
     unexplained: float  # share of the sensor's motion, without the bad windows
     track: float  # turn by the wheels / by the sensor, as configured; negative to the other side
     delay: Seconds
+    raw: float  # unexplained share with the bad windows, and with turns that only the wheels show
+    ratio: float = 1.0  # by which left must be multiplied beside right
     size: float = 1.0  # distance by positions / by the wheels, as configured
     lever: tuple[float, float] = (0.0, 0.0)  # of the sensor, ahead and to the left, m
     bad: tuple[Span, ...] = ()
+    row: str = ""  # a key of ROWS
     as_given: float = 0.0  # share that the given row does not explain
 
     @property
@@ -106,11 +115,17 @@ class Match(Struct, frozen=True):
 
     @property
     def given(self) -> bool:
-        return self.sides == "given" and self.track > 0
+        return not self.row and self.ratio == 1.0 and self.track > 0
 
     @property
-    def robot(self) -> bool:
-        return ROBOTS[0] < abs(self.track) < ROBOTS[1]
+    def cost(self) -> float:
+        return float(cost(self.raw, self.track if self.given else 0.0, self.delay))
+
+
+def cost(share: float | Floats, track: float | Floats, delay: float | Floats) -> Floats:
+    """Return by how much a row explains less than others. A possible robot has a head start."""
+    possible = (np.asarray(track) > ROBOTS[0]) & (np.asarray(track) < ROBOTS[1])
+    return np.where(possible, share, CLEARER * share + CLEAR) + DELAY_COST * np.abs(delay)
 
 
 def examined(
@@ -121,40 +136,42 @@ def examined(
     """
     base = Base.of(drive)
     matches = {sensor: matched(sensor, runs, base) for sensor in sensors(runs)}
-    if any(not (m.given and m.follows) or m.bad for m in matches.values()):
-        for cause in _facts(runs, matches, base):
-            raise LogError(cause)
+    odd = {s: m for s, m in matches.items() if not (m.given and m.follows) or m.bad}
+    for cause in _facts(runs, odd) if odd else ():
+        raise LogError(cause)
     best = min((match.unexplained for match in matches.values()), default=0.0)
     following = {
         sensor: match for sensor, match in matches.items()
         if match.follows
         and (sensor != "positions" or match.unexplained < max(POOR, POORER * best))
     }  # fmt: skip
-    if causes := [*_turned(following), *_sized(following, drive), *_late(following)]:
+    if causes := [
+        *_turned(following),
+        *_sized(following, drive, _forward(runs)),
+        *_late(following),
+    ]:
         raise LogError(". ".join(causes))
     notes = []
     for sensor, match in matches.items():
         name = NAMES[sensor]
         fact = f"{match.unexplained:.0%} of the motion by {name} is not that of the wheels"
         if not following:
+            if forward := _forward(runs):
+                raise LogError(f"{fact}, and {forward}")
             raise LogError(
                 f"{fact}, and neither swapped sides nor signs, units or delays of up to "
                 f"{WIDE_DELAYS_S[-1]:.0f} s explain it. Is {name} of the same drive, with times "
-                "from the same clock? Did the wheels roll on the floor? Does yaw_rate turn about "
-                "the axis that points up, and do x and y lie in the floor?"
+                f"from the same clock? Did the wheels roll on the floor? {QUESTIONS[sensor]}"
             )
         if sensor not in following:
             others = " and ".join(NAMES[other] for other in following)
             notes.append(f"{name} is left out: {fact}, but {others} follows them")
             runs = [without(run, sensor) for run in runs]
-        elif match.unexplained < TOO_GOOD:
-            notes.append(
-                f"{name} agrees with the wheels better than a sensor can: was it computed from "
-                "them? (The true pose of the simulator agrees, too.)"
-            )
         if sensor in following and abs(match.delay) > NOTED_LATE_S:
             notes.append(f"the times of {name} are {1000 * match.delay:.0f} ms after the wheels'")
-    kept, more = _without_spans(runs, [span for m in following.values() for span in m.bad])
+    kept, more = _without_spans(runs, sorted({span for m in following.values() for span in m.bad}))
+    if more:
+        following = {sensor: matched(sensor, kept, base) for sensor in following}
     return kept, following, [*notes, *more]
 
 
@@ -175,15 +192,9 @@ def gyro_bias(runs: Sequence[Run]) -> tuple[float, float]:
         if len(run.gyro_t) > 1:
             t = (run.gyro_t[1:] + run.gyro_t[:-1]) / 2
             rates.append((np.diff(run.turned) / np.diff(run.gyro_t))[run.rests(t)])
-    rest = np.sort(np.concatenate(rates))
-    if len(rest) <= MIN_RESTS:
-        return 0.0, BIAS_STD
-    # Most of the rates may be of a robot that somebody carries: the densest ones are at rest.
-    count = len(rest) // 5
-    first = int(np.argmin(rest[count:] - rest[: len(rest) - count]))
-    middle = float(np.median(rest[first : first + count]))
-    width = rest[first + count] - rest[first]
-    return float(np.median(rest[np.abs(rest - middle) <= 6 * width])), REST_BIAS_STD
+    rest = np.concatenate(rates)
+    known = len(rest) > MIN_RESTS
+    return (float(np.median(rest)), REST_BIAS_STD) if known else (0.0, BIAS_STD)
 
 
 def _without_spans(runs: Sequence[Run], spans: Sequence[Span]) -> tuple[list[Run], list[str]]:
@@ -213,53 +224,32 @@ def _without_spans(runs: Sequence[Run], spans: Sequence[Span]) -> tuple[list[Run
 
 def matched(sensor: str, runs: Sequence[Run], base: Base) -> Match:
     """Return the row of the table that fits a sensor: the given one, unless another is clearer."""
-    seen = Places(sensor, runs, base) if sensor == "positions" else Turns(sensor, runs, base)
-    given = seen.match("given", 1)
-    found = [seen.match(*row) for row in (("given", -1), ("one sign", 1), ("one sign", -1))]
-    best = min(found, key=lambda match: match.unexplained)
-    if best.unexplained > CLEARER * given.unexplained - CLEAR:
-        possible = [match for match in (given, *found) if match.robot]
-        # Turns of 90 deg on the spot look like turns of 270 deg to the other side.
-        if given.follows and not given.robot and possible:
-            best = min(possible, key=lambda match: match.unexplained)
-            if best.unexplained < given.unexplained + ALIAS:
-                return replace(best, as_given=given.unexplained)
-        if given.follows and abs(given.delay) < LATE_S:
-            return given
-        rows = product(("given", "angles"), (1, -1))
-        found = [seen.match(*row, wide=True) for row in rows]
-        if sensor == "headings":
-            turned = Turns(sensor, [replace(run, yaw=np.radians(run.yaw)) for run in runs], base)
-            found += [replace(turned.match("given", side), sides="degrees") for side in (1, -1)]
-        best = min(found, key=lambda match: match.unexplained)
-    clear = best.follows and best.unexplained < CLEARER * given.unexplained - CLEAR
-    return replace(best, as_given=given.unexplained) if clear else given
+    kind = Places if sensor == "positions" else Turns
+    seen = kind(sensor, runs, base)
+    found = [seen.match()]
+    if found[0].cost > CLEAR:
+        found += seen.uneven()
+    best = min(found, key=lambda match: match.cost)
+    if not (best.follows and abs(best.delay) < LATE_S):
+        found.append(seen.match(wide=True))
+        for row in ("angles", *["degrees"] * (sensor == "headings")):
+            match = kind(sensor, list(map(ROWS[row], runs)), base).match(wide=True)
+            found.append(replace(match, row=row))
+        best = min(found, key=lambda match: match.cost)
+    return replace(best if best.follows else found[0], as_given=found[0].unexplained)
 
 
-def _facts(runs: Sequence[Run], matches: Mapping[str, Match], base: Base) -> Iterator[str]:
+def _facts(runs: Sequence[Run], matches: Mapping[str, Match]) -> Iterator[str]:
     # Causes that the columns of the wheels show, if a sensor contradicts them.
-    names = " and ".join(NAMES[sensor] for sensor, m in matches.items() if not m.given)
-    left, right = (
-        np.concatenate([np.diff(getattr(run, side)) for run in runs]) for side in ("left", "right")
-    )
-    rolled = float(np.abs(left).sum() + np.abs(right).sum())
-    same = np.abs(left - right).sum() < TWICE * rolled
-    back = -float(np.minimum(left, 0.0).sum() + np.minimum(right, 0.0).sum())
-    for sensor in matches:
-        seen = Places(sensor, runs, base) if sensor == "positions" else Turns(sensor, runs, base)
-        if back < BACKWARDS * rolled and seen.unsigned() < UNSIGNED:
-            yield (
-                "the wheels never turn backwards in this log, and only with signs that it does not "
-                f"have they explain {NAMES[sensor]}: encoders with one channel, or a sign that was "
-                "lost. Record speeds with their sign" + (", and not one side twice" if same else "")
-            )
-    if same:
+    names = " and ".join(NAMES[sensor] for sensor in matches)
+    turns = sum(float(np.abs(np.diff(run.right - run.left)).sum()) for run in runs)
+    if turns < TWICE * sum(_rolled(runs, side) for side in ("left", "right")):
         yield (
-            "left and right are the same in every row, although the robot turns: the log has one "
-            "side twice. Record the wheels of both sides"
+            f"left and right are the same in every row, although the robot turns by {names}: the "
+            "log has one side twice. Record the wheels of both sides"
         )
     for side, other in (("left", "right"), ("right", "left")):
-        rolled = sum(float(np.abs(np.diff(getattr(run, other))).sum()) for run in runs)
+        rolled = _rolled(runs, other)
         alone, begin, end = max(_alone(run, side, other) for run in runs)
         if alone > ALONE * rolled:
             yield (
@@ -267,6 +257,22 @@ def _facts(runs: Sequence[Run], matches: Mapping[str, Match], base: Base) -> Ite
                 f"{alone:.0f} of its {rolled:.0f} rad, and {names} contradicts that: is its "
                 "encoder dead, or its cable loose?"
             )
+
+
+def _forward(runs: Sequence[Run]) -> str:
+    sides = [
+        side for side in ("left", "right")
+        if all(np.diff(getattr(run, side)).min() > -BACKWARDS for run in runs)
+    ]  # fmt: skip
+    words = (
+        f"{' and '.join(sides)} never turn backwards in this log. If they did, their encoders have "
+        "one channel, or a sign was lost: record speeds with their sign"
+    )
+    return words if sides else ""
+
+
+def _rolled(runs: Sequence[Run], side: str) -> float:
+    return sum(float(np.abs(np.diff(getattr(run, side))).sum()) for run in runs)
 
 
 def _alone(run: Run, side: str, other: str) -> tuple[float, Seconds, Seconds]:
@@ -290,31 +296,34 @@ def _turned(matches: Mapping[str, Match]) -> Iterator[str]:
         f"the wheels miss {worst.as_given:.0%} of the motion by {names}, but only "
         f"{worst.unexplained:.0%} if"
     )
-    kinds = {match.sides for match in odd.values()}
-    if "angles" in kinds:
+    rows = {match.row for match in odd.values()}
+    if "angles" in rows:
         yield (
             f"{fact} left and right are angles or running counts: write speeds, which are 2 pi x "
             "(counts since the last row) / (counts of a wheel turn x seconds since the last row)"
         )
-    elif "degrees" in kinds:
+    elif "degrees" in rows:
         yield f"{fact} yaw is in deg: write it in rad"
-    elif "one sign" in kinds:
-        yield f"{fact} one side has the wrong sign: turn the sign of left or of right"
+    elif worst.ratio != 1.0:
+        yield f"{fact} the speeds of left are multiplied by {worst.ratio:.2g}: " + (
+            "one side has the wrong sign. Turn the sign of left or of right"
+            if abs(worst.ratio + 1) < SAME_SIGN
+            else "has one side another unit, other counts of a wheel turn or a larger wheel?"
+        )
     elif len(odd) < len(matches):
         straight = " and ".join(NAMES[sensor] for sensor in matches if sensor not in odd)
         causes = " and ".join(MIRRORED[sensor] for sensor in odd)
         yield f"{fact} it turns to the other side, and they follow {straight}: {causes}"
     else:
-        sources = {"gyro" if sensor == "gyro" else "poses" for sensor in odd}
-        more = [MIRRORED[sensor] for sensor in odd if len(sources) == 1]
-        yield f"{fact} they turn to the other side: {', or '.join((SWAPPED, *more))}"
+        mirrored = " and ".join(MIRRORED[sensor] for sensor in odd)
+        yield f"{fact} they turn to the other side: {SWAPPED}, or {mirrored}"
 
 
-def _sized(matches: Mapping[str, Match], drive: DriveConfig) -> Iterator[str]:
+def _sized(matches: Mapping[str, Match], drive: DriveConfig, other: str) -> Iterator[str]:
     # Tracks and sizes that no robot has, and what would make them possible.
     seen = [
         (s, abs(m.track) * drive.wheel_separation_multiplier, m.size)
-        for s, m in matches.items() if m.sides != "angles"
+        for s, m in matches.items() if m.row != "angles" and m.ratio == 1.0
     ]  # fmt: skip
 
     def possible(
@@ -342,7 +351,7 @@ def _sized(matches: Mapping[str, Match], drive: DriveConfig) -> Iterator[str]:
     }
     check = USUAL_ROBOTS, SAME_SIZE
     causes = [words for k, words in speeds.items() if possible(*check, speeds=k)]
-    causes += [words for k, words in PLACES.items() if possible(*check, places=k)]
+    causes += dict.fromkeys(words for k, words in PLACES.items() if possible(*check, places=k))
     causes += [f"{NAMES[sensor]} is in deg, not in rad" for sensor, _, _ in seen
                if possible(*check, turns={sensor: 180 / math.pi})]  # fmt: skip
     # Turns of 90 deg on the spot show no track by positions, but their size is right.
@@ -351,6 +360,7 @@ def _sized(matches: Mapping[str, Match], drive: DriveConfig) -> Iterator[str]:
     ]
     yield f"{' and '.join(facts)}: " + (
         ", or ".join(causes)
+        or other
         or "is t in s, are the speeds of the wheels and yaw_rate in rad/s, x "
         "and y in m, and drive.wheel_radius and drive.wheel_separation right?"
     )
@@ -395,17 +405,15 @@ class Comparison:
     def window(self, t: Floats) -> npt.NDArray[np.int64]:
         return np.asarray(np.maximum(np.searchsorted(self.windows[0], t + 1e-6) - 1, 0))
 
-    def rolled(self, sides: str, begin: Floats, end: Floats) -> list[Floats]:
+    def rolled(self, begin: Floats, end: Floats) -> Floats:
         """Return the distances that the left and the right wheels roll, m."""
-        return [
+        return np.array([
             radius * (np.interp(end, self.run.t, side) - np.interp(begin, self.run.t, side))
-            for radius, side in zip(
-                (self.base.left, self.base.right), SIDES[sides](self.run), strict=True
-            )
-        ]
+            for radius, side in ((self.base.left, self.run.left), (self.base.right, self.run.right))
+        ])  # fmt: skip
 
     def rolls(self, begin: Floats, end: Floats) -> Mask:
-        rolled = np.abs(self.rolled("given", begin, end)).sum(axis=0)
+        rolled = np.abs(self.rolled(begin, end)).sum(axis=0)
         return np.asarray(rolled > MIN_ROLL * self.base.left)
 
     def judged(
@@ -421,7 +429,7 @@ class Comparison:
         bad = sums(off - least, known) > 0
         bad &= sums(off - BAD * moved, known) > 0
         off, moved = (sums(values, known & rolls) for values in (off, moved))
-        if moved[bad].sum() > MAX_BAD * moved.sum():
+        if bad.sum() > MAX_BAD * (bad | (moved > 0)).sum():
             bad[:] = False
         share = np.clip(off, 0.0, moved)[~bad].sum() / max(1e-9, float(moved[~bad].sum()))
         run = np.searchsorted(self.shift, self.windows[0], side="right") - 1
@@ -437,8 +445,7 @@ class Turns(Comparison):
         super().__init__(sensor, runs, base)
         self.t, self.values = self.run.yaw_t, np.unwrap(self.run.yaw)
         if sensor == "gyro":
-            self.t = self.run.gyro_t
-            self.values = self.run.turned - gyro_bias(runs)[0] * self.t
+            self.t, self.values = self.run.gyro_t, self.run.turned
         steps = np.diff(self.t)
         holes = steps > max(HOLE_S, HOLE_PERIODS * float(np.median(steps)))
         self.holes = np.concatenate(([0], np.cumsum(holes)))
@@ -453,40 +460,46 @@ class Turns(Comparison):
         turned = np.interp(end, self.t, self.values) - np.interp(begin, self.t, self.values)
         return np.where(inside & (self.holes[first] == self.holes[last]), turned, np.nan)
 
-    def match(self, sides: str, side: int, *, wide: bool = False) -> Match:
-        left, right = self.rolled(sides, self.begin, self.end)
-        wheels = (right - left) / self.base.track * side
-        best, moved = (math.inf, 1.0, 0.0), np.abs(self.seen(0.0))
-        whole = float(np.nansum(np.minimum(moved, CAP)[self.moving])) + 1e-9
-        for delay in WIDE_DELAYS_S if wide else DELAYS_S:
-            seen = self.seen(delay)
-            used = self.moving & np.isfinite(seen)
-            y, x = seen[used], wheels[used]
-            ratios = x[np.abs(y) > MIN_TURN] / y[np.abs(y) > MIN_TURN]
-            tracks = np.concatenate((np.quantile(ratios, QUANTILES) if len(ratios) else [], TRACKS))
-            tracks = tracks[tracks > LEAST_TRACK]
-            for _ in range(2):
-                off = np.minimum(np.abs(y - x / tracks[:, None]), CAP).sum(axis=1)
-                # A step that the delay loses is not explained.
-                cost = 1 + (off - np.minimum(np.abs(y), CAP).sum()) / whole
-                cost += DELAY_COST * abs(delay)
-                at = int(np.argmin(cost))
-                best = min(best, (float(cost[at]), float(tracks[at]), float(delay)))
-                tracks = tracks[at] * FINE
-        _, track, delay = best
-        off = np.abs(self.seen(delay) - np.where(self.moving, wheels, 0.0) / track)
-        off = np.where(np.isnan(off), np.minimum(moved, BAD_TURN), off)
-        share, bad = self.judged(self.begin, off, moved, self.moving, BAD_TURN)
-        return Match(self.sensor, sides, share, side * track, delay, bad=bad)
+    def match(self, *, even: bool = True, wide: bool = False) -> Match:
+        """Return the least absolute values of the turns beside those by the wheels.
 
-    def unsigned(self) -> float:
-        """Return the share of the turns that the wheels do not explain with any signs."""
-        a, b = self.rolled("given", self.begin, self.end)
-        seen = self.seen(0.0)
-        used = self.moving & np.isfinite(seen)
-        options = np.array([a + b, a - b, b - a, -a - b])[:, used] / self.base.track
-        off = np.abs(seen[used] - options[:, None] / TRACKS[:, None]).min(axis=0).sum(axis=1)
-        return float(off.min() / np.abs(seen[used]).sum())
+        A gyro has a bias, too. Both sides count alike if they are `even`.
+        """
+        left, right = self.rolled(self.begin, self.end) / self.base.track
+        bias = (self.sensor == "gyro") * (self.end - self.begin)
+        columns = np.array([right - left, bias] if even else [right, -left, bias])
+        delays = np.append(DELAYS_S, WIDE_DELAYS_S) if wide else DELAYS_S
+        seen = np.array([self.seen(delay) for delay in delays])
+        known = np.isfinite(seen)
+        y, weight = np.where(known, seen, 0.0), known.astype(float)
+        ridge = np.diag([*[1e-9] * (len(columns) - 1), 1e-3])
+        for _ in range(ROUNDS):
+            normal = np.einsum("dn,in,jn->dij", weight, columns, columns)
+            normal += ridge * (1 + weight.sum(axis=1))[:, None, None]
+            score = np.einsum("dn,in,dn->di", weight, columns, y)
+            shares = np.linalg.solve(normal, score[:, :, None])[:, :, 0]
+            off = np.abs(y - shares @ columns)
+            weight = known / np.maximum(off, LEAST_TURN)
+        mean = shares[:, :-1].mean(axis=1)
+        tracks = 1 / np.where(np.abs(mean) > 1e-6, mean, 1e-6)
+        moved = np.abs(y - shares[:, -1:] * bias)
+        used = known & self.moving
+        off, most = (np.minimum(values, CAP) * used for values in (off, moved))
+        share = np.minimum(off.sum(axis=1) / (most.sum(axis=1) + 1e-9), 1.0)
+        # A step that the delay loses is not explained.
+        share = 1 - (1 - share) * used.sum(axis=1) / max(1, int(self.moving.sum()))
+        at = int(np.argmin(cost(share, tracks, delays)))
+        track, delay, raw = (float(values[at]) for values in (tracks, delays, share))
+        wheels = np.where(self.moving, columns[:-1].T @ shares[at, :-1], 0.0)
+        off = np.abs(y[at] - shares[at, -1] * bias - wheels)
+        off = np.where(known[at], off, np.minimum(moved[at], BAD_TURN))
+        judged, bad = self.judged(self.begin, off, moved[at], self.moving, BAD_TURN)
+        ratio = 1.0 if even else float(shares[at, 1] / (shares[at, 0] or 1e-9))
+        return Match(self.sensor, judged, track, delay, raw, ratio, bad=bad)
+
+    def uneven(self) -> list[Match]:
+        found = self.match(even=False)
+        return [] if SAME_SIZE[0] < found.ratio < SAME_SIZE[1] else [found]
 
 
 class Places(Comparison):
@@ -503,16 +516,16 @@ class Places(Comparison):
         self.grid = np.concatenate(edges)
         between = self.run.place[1:-1] - (self.run.place[2:] + self.run.place[:-2]) / 2
         self.noise = float(np.median(np.abs(between))) / math.sqrt(1.5)
-        self.rolling = {s: self.rolled(s, self.grid[:-1], self.grid[1:]) for s in SIDES}
+        self.rolling = self.rolled(self.grid[:-1], self.grid[1:])
         # A part of a long log suffices for the search.
         every = int(sum(run.seconds for run in runs) / SEARCH_S)
         parts = [run.part(a, a + WINDOW_S) for run in runs
                  for a in np.arange(run.t[0], run.t[-1] - STEP_S, WINDOW_S)]  # fmt: skip
         self.few = Places(sensor, parts[::every], base) if 1 < every < len(parts) / 3 else self
 
-    def fitted(self, sides: str, track: float, delay: Seconds) -> tuple[float, Floats, Floats]:
+    def fitted(self, ratio: float, track: float, delay: Seconds) -> tuple[float, Floats, Floats]:
         """Return the unexplained share, size of the wheels and lever, and each error, m."""
-        a, b = self.rolling[sides]
+        a, b = self.rolling * [[ratio], [1.0]]
         place, heading = path((a + b) / 2, (b - a) / (self.base.track * track))
         at = self.t - delay
         model = np.interp(at, self.grid, place.real) + 1j * np.interp(at, self.grid, place.imag)
@@ -539,37 +552,31 @@ class Places(Comparison):
         wrong, moved = (np.add.reduceat(v, self.first) for v in (off, np.abs(seen)))
         return float(np.minimum(wrong, moved).sum() / max(1e-9, moved.sum())), x, off
 
-    def match(self, sides: str, side: int, *, wide: bool = False) -> Match:
+    def match(self, ratio: float = 1.0, *, wide: bool = False) -> Match:
         few = self.few
 
         def best(tracks: Floats, delays: Floats) -> tuple[float, float, float]:
             return min(
-                (few.fitted(sides, track, delay)[0] + DELAY_COST * abs(delay), track, delay)
+                (float(cost(few.fitted(ratio, track, delay)[0], track, delay)), track, delay)
                 for track in tracks.tolist() for delay in delays.tolist()
             )  # fmt: skip
 
-        tracks = WIDE_TRACKS if wide else TRACKS
-        _, track, delay = best(side * tracks, np.zeros(1))
-        if wide and sides == "given":
-            late = best(side * TRACKS[::3], WIDE_DELAYS_S)
-            track, delay = min((few.fitted(sides, track, delay)[0], track, delay), late)[1:]
+        tracks = np.outer((1.0, -1.0), WIDE_TRACKS if wide else TRACKS).ravel()
+        found = best(tracks, np.zeros(1))
+        if wide:
+            found = min(found, best(np.outer((1.0, -1.0), TRACKS[::3]).ravel(), WIDE_DELAYS_S))
+        _, track, delay = found
         _, _, delay = best(np.array([track]), delay + DELAYS_S)
-        _, track, _ = best(np.append(side * TRACKS, track * FINE), np.array([delay]))
-        raw, (size, ahead, aside), off = self.fitted(sides, track, delay)
+        _, track, _ = best(np.append(tracks, track * FINE), np.array([delay]))
+        raw, (size, ahead, aside), off = self.fitted(ratio, track, delay)
         moved = np.abs(self.place - (np.add.reduceat(self.place, self.first)
                                      / np.bincount(self.part))[self.part])  # fmt: skip
         rolls = self.rolls(self.t - STEP_S / 2, self.t + STEP_S / 2)
         share, bad = self.judged(self.t, off - self.noise, moved, rolls, BAD_WAY_M)
-        share = max(share, min(raw, TOO_GOOD))  # the noise does not hide that it is too good
-        if not tracks[0] < abs(track) < tracks[-1]:
+        if not tracks.min() < track < tracks.max():
             share = max(share, FOLLOWS)  # the best track is none of a robot
         lever = float(ahead), float(aside)
-        return Match(self.sensor, sides, share, track, delay, float(size), lever, bad)
+        return Match(self.sensor, share, track, delay, raw, ratio, float(size), lever, bad)
 
-    def unsigned(self) -> float:
-        """Return the share of the ways that the wheels do not explain with any signs."""
-        ends = [np.interp(t, self.t, self.place) for t in (self.begin, self.end)]
-        ways = np.abs(ends[1] - ends[0])
-        a, b = self.rolled("given", self.begin, self.end)
-        off = np.minimum(np.abs(ways - np.abs(a + b) / 2), np.abs(ways - np.abs(a - b) / 2))
-        return float(off.sum() / max(1e-9, ways.sum()))
+    def uneven(self) -> list[Match]:
+        return [self.match(ratio) for ratio in RATIOS]

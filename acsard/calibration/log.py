@@ -47,9 +47,11 @@ STANDSTILL_SPEED = 0.02  # rad/s, up to which a wheel stands
 REST_S = 0.4  # over which the wheels must hardly roll: an encoder at rest may rock between counts
 REST_ROLL = 0.03  # rad
 
-# A value stands apart if it is far from both neighbours, which are near to each other. Single ones
-# are wrong; if there are many, two programs write one column.
-APART, NEAR_SHARE, FAR_SHARES = 5.0, 0.1, 3.0  # of the range of the values
+# A value stands apart if a jump leads to it and the next jump leads back. Single ones are wrong; if
+# there are many, two programs write one column.
+BACK, NOISES, STAY_S = 0.2, 12.0, 0.1  # of the jump; of the quartile of the differences; until back
+NEAR_SHARE, FAR_SHARES = 0.1, 3.0  # of the range of the values
+FAR_STEPS = 5.0  # of the usual step of positions
 MAX_APART, STEPS = 0.2, 1.5  # share of the moving values; steps of a coarse encoder
 
 STUCK_S, STUCK_TURN = 1.0, 0.3  # a gyro that repeats one value while the wheels' turn changes, rad
@@ -59,7 +61,7 @@ MAX_BYTES = 1 << 30  # a file is read into memory
 TAPE_STD_M = 0.01  # of a distance, with the choice of the point on the robot
 STRAIGHT, MIN_STRAIGHT = 0.9, 5.0  # share of the rolled angle, and this angle, rad
 
-MAX_SIDE_DIFFERENCE = 0.8  # of front and rear wheel, as a share of the rolled angle
+MAX_SIDE_DIFFERENCE = 0.15  # of front and rear wheel, as a share of the rolled angle
 
 ADVICE = (
     "write a CSV file with commas, decimal points and SI units, whose first line names the columns "
@@ -201,7 +203,7 @@ def read(data: bytes) -> Log:
         columns = table.columns
         for name in [name for name in (*FOUR, *TWO, "yaw_rate") if name in columns]:
             rows = np.flatnonzero(np.isfinite(columns[name]))
-            wild = rows[apart(name, columns[name][rows])]
+            wild = rows[apart(name, columns["t"][rows], columns[name][rows])]
             table.notes.add(f"cells of {name} left out, far from those beside them, such as "
                        f"{columns[name][wild[:1]].sum():g}: {{}}", len(wild))  # fmt: skip
             columns[name][wild] = math.nan
@@ -299,28 +301,33 @@ def _used(header: Sequence[str]) -> list[str]:
     return used
 
 
-def apart(name: str, values: Floats | Complexes) -> Mask:
+def apart(name: str, t: Floats, values: Floats | Complexes) -> Mask:
     """Return a mask of single values that are wrong. Raise `LogError` if two series alternate."""
     mask = np.zeros(len(values), dtype=bool)
     if len(values) < MIN_ROWS:
         return mask
     places = np.iscomplexobj(values)
     sizes = np.abs(values - (np.mean(values) if places else 0.0))
-    usual = float(np.quantile(sizes, 0.95))
+    usual, jumps = float(np.quantile(sizes, 0.95)), np.abs(np.diff(values))
+    # Of two series that alternate, every second or fourth value is of the same one.
+    noise = min(np.quantile(np.abs(values[k:] - values[:-k]), 0.25) for k in range(1, 5))
     # A coarse encoder alternates between multiples of its step.
     step = float(np.quantile(np.abs(values[values != 0]), 0.02)) if values.any() else 0.0
-    away = np.abs(values[1:-1] - (values[2:] + values[:-2]) / 2)
-    alone = away > APART * np.abs(values[2:] - values[:-2])
-    far = max(NEAR_SHARE * usual, 0.0 if places else STEPS * step)
-    moving = (np.maximum(sizes[1:-1], away) > far) | places
-    if (alone & (away > far)).sum() > MAX_APART * max(moving.sum(), 5 * MIN_ROWS):
+    far = max(NOISES * float(noise), 0.0 if places else max(NEAR_SHARE * usual, STEPS * step))
+    undone = np.zeros((max(1, round(STAY_S / max(1e-3, float(np.median(np.diff(t)))))), len(jumps)),
+                      dtype=bool)  # fmt: skip
+    for k, row in enumerate(undone[:, : len(jumps) - 1], 1):
+        back = np.abs(values[1 + k :] - values[: -1 - k]) < BACK * jumps[:-k]
+        row[: len(back)] = back & (np.minimum(jumps[:-k], jumps[k:]) > far)
+    moving = (np.maximum(sizes[1:], sizes[:-1]) > far) | places
+    if undone.any(axis=0).sum() > MAX_APART * max(moving.sum(), 5 * MIN_ROWS):
         raise LogError(
-            f"in {name}, two series of values alternate: every other value is far from those "
-            "beside it, as if two programs or sensors wrote it (a joint_state_publisher beside the "
-            "driver, or two IMUs on one topic). Record only one of them"
+            f"in {name}, two series of values alternate: the values jump to and fro, as if two "
+            "programs or sensors wrote them (a joint_state_publisher beside the driver, or two "
+            "IMUs on one topic). Record only one of them"
         )
-    step = APART * float(np.median(np.abs(np.diff(values))))
-    mask[1:-1] = alone & (away > (max(far, step) if places else FAR_SHARES * usual))
+    least = FAR_STEPS * float(np.median(jumps)) if places else FAR_SHARES * usual
+    mask[1:-1] = undone[0, :-1] & (jumps[:-1] > least)
     return mask
 
 
@@ -337,11 +344,18 @@ def _sides(table: _Table) -> tuple[Floats, Floats]:
             for v in (a - b, np.maximum(np.abs(a), np.abs(b)))
         )
         if apart > MAX_SIDE_DIFFERENCE * rolled:
-            dead, alive = (front, rear) if np.abs(a).sum() < np.abs(b).sum() else (rear, front)
+            odd, alive = (front, rear) if np.abs(a).sum() < np.abs(b).sum() else (rear, front)
+            low, high = (a, b) if odd == front else (b, a)
+            still = np.abs(low) < STANDSTILL_SPEED
+            cause = f"has it another unit or other counts than {alive}, or is it of the other side"
+            if np.abs(high[still]).sum() > apart / rolled / 2 * np.abs(high).sum():
+                cause = "it stands still meanwhile: is its encoder dead, or its cable loose"
+            elif float(low @ high) < 0.0:
+                cause = "it turns against it: has it the wrong sign, or is it of the other side"
             raise LogError(
-                f"{dead} rolls otherwise than {alive}: is an encoder dead, or has it the wrong "
-                "sign? Rename the columns of the working wheels to left and right, and leave the "
-                "others out"
+                f"{odd} rolls otherwise than {alive} by {apart / rolled:.0%} of the way: {cause}? "
+                "Rename the columns of the working wheels to left and right, and leave the others "
+                "out"
             )
     fr, fl, rl, rr = (columns[name] for name in FOUR)
     return (fl + rl) / 2, (fr + rr) / 2
@@ -417,9 +431,9 @@ def run_of(name: str, streams: Mapping[str, tuple[Floats, ...]], notes: Notes) -
         integral(gyro_t, rate), place_t - start, x + 1j * y, yaw_t - start, yaw,
         commands[0] - start, np.column_stack(commands[1:]),
     )  # fmt: skip
-    apart("yaw_rate", rate)
-    apart("yaw", np.exp(1j * yaw))
-    wild = apart("x, y", run.place)
+    apart("yaw_rate", gyro_t, rate)
+    apart("yaw", yaw_t, np.exp(1j * yaw))
+    wild = apart("x, y", place_t, run.place)
     notes.add("rows of x, y left out, far from those beside them: {}", int(wild.sum()))
     run = replace(run, place_t=run.place_t[~wild], place=run.place[~wild])
     return _without_repeats(notes, _without_stuck(notes, run, rate))

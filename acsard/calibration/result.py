@@ -29,6 +29,7 @@ from acsard.terminal.output import table
 MAX_SPEED, MAX_TURNS = 10.0, 1000.0  # m/s, 360 deg
 CONTRADICTION, CONTRADICTIONS = 0.1, 4.0  # of two tracks, as a fraction and in deviations
 ALONE_RUNS = 40  # of many runs, these suffice to compare the tracks by two sensors
+EXACT_TURN, EXACT_M = 3e-4 * math.tau, 3e-4  # errors below those of a sensor: of a turn, rad; m
 MIN_ROLLED = 20.0  # rad, by the wheels of a log
 DRIVE = (
     "stand for 3 s, drive 2 m ahead and back, turn three times to each side, slowly and fast, then "
@@ -83,17 +84,37 @@ def calibrate(log: Log, config: Config, source: str) -> Result:
         runs, matches, notes = examined(log.runs, config.drive)
         log = Log(tuple(runs), (*notes, *log.notes))
         _require_one_robot(runs, config, matches)
-        return _require_drive(_result(log, config, source, fit(runs, config, matches)))
+        found = fit(runs, config, matches)
+        if not found.tracked:
+            raise LogError(
+                f"{' and '.join(found.sensors)} show no track, because others fit them as well: "
+                "drive on after each turn on the spot, and drive curves"
+            )
+        log = Log(log.runs, (*_too_good(found), *log.notes))
+        return _require_drive(_result(log, config, source, found))
     except LogError as error:
         for note in log.notes:
             error.add_note(note)
         raise
 
 
+def _too_good(found: Fit) -> Iterator[str]:
+    turns = next((NAMES[sensor] for sensor in found.sensors if sensor in ("gyro", "headings")), "")
+    for name, errors, least in ((turns, found.turn, EXACT_TURN), ("x, y", found.place, EXACT_M)):
+        if errors and errors.new < least:
+            yield (
+                f"{name} agrees with the wheels better than a sensor can: was it computed from "
+                "them? (The true pose of the simulator agrees, too.)"
+            )
+
+
 def _require_motion(runs: Sequence[Run]) -> None:
     rolled = sum(float(np.abs(np.diff(side)).sum()) for r in runs for side in (r.left, r.right)) / 2
     if rolled < MIN_ROLLED:
-        raise LogError(f"the wheels roll only {rolled:.1f} rad in this log: {DRIVE}")
+        raise LogError(
+            f"the wheels roll only {rolled:.1f} rad in this log. If the robot drove farther, t is "
+            f"not in s, or the speeds of the wheels are not in rad/s; else {DRIVE}"
+        )
 
 
 def _require_drive(result: Result) -> Result:
@@ -120,8 +141,8 @@ def _require_one_robot(runs: Sequence[Run], config: Config, matches: Mapping[str
         alone[sensor] = fit([without(run, *others) for run in some], config, {sensor: match})
     values = {
         sensor: (found.p[TRACK] - (found.p[LEFT] + found.p[RIGHT]) / 2, found.shares[0])
-        for sensor, found in alone.items()
-    }
+        for sensor, found in alone.items() if found.tracked
+    }  # fmt: skip
     for (a, (track, std)), (b, (other, other_std)) in combinations(values.items(), 2):
         if abs(track - other) > max(CONTRADICTION, CONTRADICTIONS * math.hypot(std, other_std)):
             words = " and ".join(
@@ -154,8 +175,11 @@ def _result(log: Log, config: Config, source: str, found: Fit) -> Result:
     decisions += _response(log, config, settings)
     if not settings:
         off = np.abs(found.p[[LEFT, RIGHT, TRACK]])
-        agrees = (found.readings is None or found.readings.now <= AGREES) and bool(
-            np.all(off < np.maximum(AGREES * np.sqrt(np.diag(found.covariance)), SMALL))
+        exact = any(_too_good(found))
+        agrees = (
+            not exact
+            and (found.readings is None or found.readings.now <= AGREES)
+            and bool(np.all(off < np.maximum(AGREES * np.sqrt(np.diag(found.covariance)), SMALL)))
         )
         verdict = (
             "Your robot agrees with its configuration" if agrees else "No value is surely better"

@@ -66,7 +66,7 @@ FAULTS: dict[str, tuple[Callable[[Columns], Columns], str]] = {
     "rpm": (times(60 / 2 / np.pi, *WHEELS), "in rpm"),
     "deg": (times(180 / np.pi, *WHEELS), "in deg/s"),
     "one side twice": (lambda r: r | {"left": r["right"]}, "has one side twice"),
-    "no signs": (lambda r: r | {n: np.abs(r[n]) for n in WHEELS}, "signs? that"),
+    "no signs": (lambda r: r | {n: np.abs(r[n]) for n in WHEELS}, "a sign was lost"),
     "dead from half": (_dead, "is its encoder dead"),
     "2 s late": (lambda r: r, r"2\.0 s after those of the wheels"),
     "another drive": (lambda r: r, "of the same drive"),

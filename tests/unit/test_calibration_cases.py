@@ -101,7 +101,7 @@ def test_odd_joints_give_the_same_values(
     ("kind", "cause"),
     [
         ("two publishers", r"two series of angles alternate.*joint_state_publisher"),
-        ("one channel", r"never turn backwards.*encoders with one channel"),
+        ("one channel", r"never turn backwards.*encoders have one channel"),
     ],
 )
 def test_joints_of_a_known_fault_are_refused_with_the_cause(

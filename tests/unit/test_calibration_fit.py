@@ -16,7 +16,7 @@ from acsard.calibration.fit import AHEAD, ASIDE, BIAS, GYRO_DELAY, POSE_DELAY, P
 from acsard.calibration.geometry import LEFT, RIGHT, TRACK, Base
 from acsard.calibration.log import LogError, TapeReading
 from acsard.core.config.settings import Config
-from tests.unit.calibration_logs import WAYS, fitted, ideal, multipliers, run, usual
+from tests.unit.calibration_logs import IDEAL, WAYS, fitted, ideal, multipliers, run, usual
 from tests.unit.calibration_robots import (
     GUIDED,
     RADIUS,
@@ -107,6 +107,17 @@ def away(drives: Sequence[Drive], values: Floats) -> float:
         where = np.cumsum((quick + fast) / 2 * np.exp(1j * yaw))
         squares.append(np.mean(np.abs(where - trip.where) ** 2))
     return float(np.sqrt(np.mean(squares)))
+
+
+def test_runs_that_differ_widen_the_deviation_by_their_own_spread() -> None:
+    still, curves = (3.0, 0.0, 0.0), [(12.0, 0.3, 0.5), (12.0, 0.3, -0.5)]
+    sound = replace(Robot(), **(IDEAL | {"gyro_noise": 0.004}))  # type: ignore[arg-type]
+    made = [
+        drive(replace(sound, left=1 + part, right=1 - part), [still, *curves, still])
+        for part in (0.01, -0.01, 0.01, -0.01)
+    ]
+    # The ratio of the radii is 1 +- 0.023 from run to run, so that of four is 1 +- 0.012.
+    assert 0.011 < fitted(*made, places=False).shares[1] < 0.016
 
 
 def slow_drives(seed: int, **other: float) -> list[Drive]:

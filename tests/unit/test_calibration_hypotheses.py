@@ -13,10 +13,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from acsard.calibration.log import Log, LogError, read
+from acsard.calibration.geometry import path
+from acsard.calibration.log import Log, LogError, Notes, read, run_of
 from acsard.calibration.result import Result, calibrate
-from acsard.core.config.settings import Config
-from tests.unit.calibration_bags import DRIVE, END
+from acsard.core.config.settings import Config, DriveConfig
+from tests.unit.calibration_bags import DRIVE, END, motion
 from tests.unit.calibration_faults import (
     FAULTS,
     NOT_SHOWN,
@@ -165,8 +166,41 @@ def degrees(rows: Columns) -> Columns:
     return rows | {"yaw": np.degrees(np.angle(np.exp(1j * rows["yaw"])))}
 
 
+def on_earth() -> bytes:
+    """Return a log with positions in degrees, which need seven decimals."""
+    rows = sound(3, PLACES)
+    cells = [[f"{v:.8f}" if np.isfinite(v) else "" for v in column]
+             for column in degrees_on_earth(rows).values()]  # fmt: skip
+    return "\n".join([",".join(rows), *map(",".join, zip(*cells, strict=True)), ""]).encode()
+
+
+SPOT = motion([(3, 0, 0), *[(8, 0, w) for w in (0.8, -0.8, 1.2, -1.2)] * 2, (4, 0.3, 0), (3, 0, 0)])
+
+
 def angles(factor: float, names: tuple[str, ...] = GYRO) -> bytes:
     return csv(times(factor, "left", "right")(sound(3, names, angles=True)))
+
+
+def between(rows: Columns, begin: float, end: float, value: float, *names: str) -> Columns:
+    """Replace what the columns say in a part of the drive, with the noise of a sensor."""
+    part = (rows["t"] >= begin * END) & (rows["t"] < end * END)
+    noise = np.random.default_rng(8).normal(0.0, 0.004, len(part))
+    return rows | {n: np.where(part, value + noise + 0 * rows[n], rows[n]) for n in names}
+
+
+def groups(rows: Columns, count: int, of: int) -> Columns:
+    """Replace `count` of every `of` samples of the gyro by those of one that rests."""
+    other = np.arange(len(rows["t"])) % of < count
+    return rows | {"yaw_rate": np.where(other, 0.0, rows["yaw_rate"])}
+
+
+def moved(rows: Columns, by: float) -> Columns:
+    """Move all positions of the second half of the drive."""
+    return rows | {n: rows[n] + by * (rows["t"] > END / 2) for n in PLACES}
+
+
+def degrees_on_earth(rows: Columns) -> Columns:
+    return rows | {"x": 11.5 + rows["x"] / 74_000, "y": 48.1 + rows["y"] / 111_300}
 
 
 MIXED = "two series of values alternate"
@@ -197,6 +231,18 @@ CAUSES: dict[str, tuple[Callable[[], bytes], str]] = {
     "angles, by positions": (lambda: angles(1.0, PLACES), ADD_UP),
     "m/s": (lambda: changed(PLACES, 3, times(0.05, "left", "right")), "in m/s at the rim"),
     "turns/s": (lambda: changed(BOTH, 3, times(0.5 / np.pi, "left", "right")), "in turns/s"),
+    "longitude and latitude": (on_earth, "degrees of longitude and latitude"),
+    "left x 2": (lambda: changed(GYRO, 3, times(2.0, "left")), "multiplied by 0.5: has one side"),
+    "left x 1.4, hardly straight": (
+        lambda: csv(times(1.4, "left")(sound(3, GYRO, SPOT))), "multiplied by 0.71: has one side"),
+    "right x 4": (lambda: changed(BOTH, 3, times(4.0, "right")), "multiplied by 4: has one side"),
+    "left in rpm": (lambda: changed(GYRO, 3, times(9.549, "left")), "multiplied by 0.1: has one"),
+    "IMUs in pairs": (lambda: changed(GYRO, 2, lambda r: groups(r, 2, 4)), f"yaw_rate, {MIXED}"),
+    "one IMU in five": (lambda: changed(GYRO, 2, lambda r: groups(r, 1, 5)), f"yaw_rate, {MIXED}"),
+    "receivers 0.5 m apart": (lambda: alternating(PLACES, "x", 0.5, 2), f"x, y, {MIXED}"),
+    "turns on the spot": (
+        lambda: changed(PLACES, 3, lambda r: between(r, 0.69, 1.1, np.nan, *PLACES)),
+        "positions show no track"),
     "mm": (lambda: changed(BOTH, 3, times(1000.0, *PLACES)), "in mm"),
 }  # fmt: skip
 
@@ -226,6 +272,15 @@ RIGHT: dict[str, tuple[Callable[[], bytes], tuple[float, ...], str]] = {
     "gyro about another axis": (
         lambda: changed(BOTH, 6, lambda r: noisy(times(0.0, "yaw_rate")(r), 0.2, "yaw_rate")),
         BY_POSES, "yaw_rate is left out"),
+    "places stay for the first third": (
+        lambda: changed(BOTH, 6, lambda r: between(r, 0.0, 0.33, 0.0, *PLACES)), BY_POSES,
+        LEFT_OUT),
+    "wheels stand in the log": (
+        lambda: changed(GYRO, 6, lambda r: between(r, 0.4, 0.6, 0.0, "left", "right")), BY_GYRO,
+        LEFT_OUT),
+    "map jumps by 10 m": (lambda: changed(PLACES, 6, lambda r: moved(r, 10.0)), BY_POSES, ""),
+    "no curves by positions": (
+        lambda: changed(BOTH, 6, lambda r: between(r, 0.69, 1.1, np.nan, *PLACES)), BY_POSES, ""),
     "places +- 10 cm": (lambda: changed(BOTH, 6, lambda r: noisy(r, 0.1, *PLACES)), BY_POSES, ""),
 }  # fmt: skip
 
@@ -244,6 +299,14 @@ def test_a_sensor_that_was_computed_from_the_wheels_is_noted() -> None:
     notes = calibrate(log, Config(), "a.csv").notes
     assert any("yaw_rate agrees with the wheels better than a sensor can" in n for n in notes)
     assert notes[-1] == "a note"
+    where, _ = path((trip.left + trip.right) * 0.025 * 0.01, rate * 0.01)
+    streams = {"left right": (trip.t, trip.left, trip.right),
+               "x y": (trip.t[::5], where.real[:-1:5], where.imag[:-1:5])}  # fmt: skip
+    notes = calibrate(Log((run_of("1", streams, Notes()),), ()), Config(), "a.csv").notes
+    assert any("x, y agrees with the wheels better than a sensor can" in n for n in notes)
+    agreeing = Config(drive=DriveConfig(wheel_separation_multiplier=1.5))
+    with pytest.raises(LogError, match="No value is surely better"):
+        calibrate(Log((run_of("1", streams, Notes()),), ()), agreeing, "a.csv")
 
 
 def test_wheels_that_hardly_roll_are_refused() -> None:

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 import pytest
 
-from acsard.calibration.log import LogError, read, with_distance
+from acsard.calibration.log import Floats, LogError, read, with_distance
 from tests.unit.calibration_logs import run, usual
 from tests.unit.calibration_robots import Robot, drive
 
@@ -87,10 +89,27 @@ def test_single_wrong_cells_are_left_out_with_a_note() -> None:
     assert log.notes == ("cells of left left out, far from those beside them, such as 5000: 1",)
 
 
-def test_a_dead_wheel_is_refused_and_named() -> None:
-    rows = [f"{0.05 * n:.3f},2,2,0,2,0.1" for n in range(200)]
-    with pytest.raises(LogError, match="rl rolls otherwise than fl"):
+@pytest.mark.parametrize(
+    ("wheel", "words"),
+    [
+        (lambda fl, fr, t: 0 * fl, "dead, or its cable loose"),
+        (lambda fl, fr, t: np.where(t > 12.0, 0.0, fl), "dead, or its cable loose"),
+        (lambda fl, fr, t: -fl, "wrong sign"),
+        (lambda fl, fr, t: fr, "of the other side"),
+        (lambda fl, fr, t: fl / 2, "another unit or other counts"),
+        (lambda fl, fr, t: 2 * fl, "another unit or other counts"),
+    ],
+)
+def test_a_wheel_that_rolls_otherwise_than_its_neighbour_is_refused_with_the_cause(
+    wheel: Callable[..., Floats], words: str
+) -> None:
+    t = 0.05 * np.arange(400)
+    left, right = 2 + 4 * np.sin(t), 2 - 4 * np.sin(t)
+    columns = (t, right, wheel(left, right, t), left, right, 0 * t)
+    rows = [",".join(f"{v:.4f}" for v in row) for row in zip(*columns, strict=True)]
+    with pytest.raises(LogError, match=r"(rl|fl) rolls otherwise than (fl|rl) by \d+%") as refused:
         read(text(rows, "t,fr,fl,rl,rr,yaw_rate"))
+    assert words in str(refused.value)
 
 
 def test_a_distance_is_that_of_the_straightest_run_or_of_the_named_one() -> None:
