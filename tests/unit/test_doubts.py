@@ -38,10 +38,10 @@ class Bench:
             self.doubt += self.trail.follow(command, shown, STEP_S, LAG_S, self.count)
 
     def rest(self) -> bool:
-        explained = self.trail.rest(LAG_S, self.count)
-        if explained:
+        self.trail.rest(LAG_S, self.count)
+        if not self.trail.largest:
             self.doubt = 0.0
-        return explained
+        return not self.trail.largest
 
 
 @each("motor", [0.02, 0.1, 0.3])

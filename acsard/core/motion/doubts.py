@@ -10,12 +10,13 @@ contradict each other are in doubt by half of their difference.
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 from msgspec import Struct, field
 
 from acsard.core.motion.gaps import AT_REST, plus
 from acsard.core.motion.obedience import AGREEMENT
-from acsard.core.motion.uncertainty import Missed
+from acsard.core.motion.sides import SideName
 from acsard.core.motion.wheels import Wheels
 from acsard.core.values import Rad, RadPerS, Seconds, Wheels4
 
@@ -74,16 +75,14 @@ class Trail(Struct):
         self.largest = max(self.largest, abs(self.astray + self.weak))
         return more
 
-    def rest(self, lag: Seconds, count: Rad) -> bool:
-        """Note that the side rests, and return whether a delay explains all of the doubt."""
+    def rest(self, lag: Seconds, count: Rad) -> None:
+        """Note that the side rests: a delay may explain all of the doubt."""
         self.expected = self.due = self.shown = self.seconds = 0.0
         fastest, self.fastest = self.fastest, 0.0
         left = max(abs(self.astray + self.weak), abs(self.short)) - COUNTS * count
         taken = self.largest - COUNTS * count
-        if not self.largest or left > LEFT_S * fastest or taken > (TAKEN_S + lag) * fastest:
-            return False
-        self.astray = self.weak = self.largest = 0.0
-        return True
+        if left <= LEFT_S * fastest and taken <= (TAKEN_S + lag) * fastest and not self.differs:
+            self.astray = self.weak = self.largest = 0.0
 
     def restart(self, speed: RadPerS) -> None:
         """Note that nobody knows what is expected of a side with this speed."""
@@ -92,6 +91,14 @@ class Trail(Struct):
     def forget(self) -> None:
         self.astray = self.weak = self.largest = self.short = self.recent = 0.0
         self.differs = False
+
+
+class Found(NamedTuple):
+    """Angles that the pose may have missed, rad."""
+
+    astray: Wheels4  # of the sides
+    wheels: list[tuple[SideName, Wheels4]]  # of a side whose wheels contradict each other
+    explained: bool  # a delay explains all that the sides were in doubt of
 
 
 class Doubts(Struct):
@@ -125,32 +132,32 @@ class Doubts(Struct):
         if wheels.fault is not None:
             self.left.differs = self.right.differs = True
 
-    def update(
-        self, wheels: Wheels, lag: Seconds, count: Rad
-    ) -> list[tuple[Missed, Wheels4 | None]]:
-        """Return angles that the pose may have missed, by cause; None: a delay explains all."""
+    def update(self, wheels: Wheels, lag: Seconds, count: Rad) -> Found:
+        """End the open lines, and return what is in doubt now."""
         s, rolled = self.seconds, self.rolled
         used = plus(wheels.believed(rolled), self.repaired)
-        found: list[tuple[Missed, Wheels4 | None]] = []
+        astray, wheels_astray, explained = AT_REST, list[tuple[SideName, Wheels4]](), s > 0.0
         trails = (self.left, self.right)
         for trail, side, commanded in zip(trails, wheels.sides, self.commanded, strict=True):
-            angle = (used[side.front] + used[3 - side.front]) / 2
             if s <= 0.0:
-                continue
-            if all(wheels.wheels[i].rested for i in side.wheels):
-                if trail.rest(lag, count):
-                    found.append((side.name, None))
+                break
+            angle, missed = (used[side.front] + used[3 - side.front]) / 2, 0.0
+            rests = all(wheels.wheels[i].rested for i in side.wheels)
+            if rests:
+                trail.rest(lag, count)
             elif self.unknown:
                 trail.restart(angle / s)
-            elif missed := trail.follow(commanded / s, angle, s, lag, count):
-                found.append((side.name, of_side(side.front, missed)))
+            else:
+                missed = trail.follow(commanded / s, angle, s, lag, count)
+            explained = explained and rests and not trail.largest
+            if missed:
+                astray = plus(astray, of_side(side.front, missed))
             if side.out >= 0 or side.slip_s > 0.0:
                 half = (rolled[side.front] - rolled[side.rear]) / 2
-                cause: Missed = "left wheels" if side.name == "left" else "right wheels"
-                found.append((cause, of_side(side.front, half)))
+                wheels_astray.append((side.name, of_side(side.front, half)))
         self.commanded, self.seconds, self.unknown = (0.0, 0.0), 0.0, False
         self.rolled = self.repaired = AT_REST
-        return found
+        return Found(astray, wheels_astray, explained)
 
     def forget(self) -> None:
         """Forget all doubts: the pose was set."""

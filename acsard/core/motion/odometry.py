@@ -174,13 +174,17 @@ class Odometry(Struct):
                 uncertainty.miss("gap", distance, 0.0 if turn is not None else angle, heading)
             if turn is not None and turn.doubt:
                 uncertainty.miss("gyro", 0.0, turn.doubt, heading)
-            lag, count = model.feedback.response_time, model.wheel_count
-            for cause, angles in self.doubts.update(wheels, lag, count):
-                if angles is None:
-                    uncertainty.forgive(cause)
-                    continue
+            found = self.doubts.update(wheels, model.feedback.response_time, model.wheel_count)
+            if found.explained:
+                uncertainty.forgive()
+            turns = 0.0 if turn is not None else 1.0
+            if found.astray != AT_REST:
+                distance, angle = model.kinematics.moved(found.astray)
+                uncertainty.miss("way", distance, 0.0, heading)
+                uncertainty.miss("turn", 0.0, turns * angle, heading)
+            for side, angles in found.wheels:
                 distance, angle = model.kinematics.moved(angles)
-                uncertainty.miss(cause, distance, 0.0 if turn is not None else angle, heading)
+                uncertainty.miss(side, distance, turns * angle, heading)
         return Estimate(
             line.at, self.pose, self.twist, uncertainty.covariance, uncertainty.twist,
             self.positions, speeds, line.asked_ns, line.heard_ns,

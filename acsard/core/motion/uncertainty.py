@@ -69,8 +69,9 @@ ORIGIN: Vector = (0.0, 0.0, 0.0)
 NO_EFFECT: Effect = (0.0, 0.0, 0.0, 0.0)
 
 # Causes of an error that do not average out. The motion that the pose may have missed is that of
-# gaps, and the differences of gyro and wheels, of a side and its command, and of its two wheels.
-Missed = Literal["gap", "gyro", "left", "right", "left wheels", "right wheels"]
+# gaps, and the differences of gyro and wheels, of the wheels and their commands (`way` and `turn`),
+# and of the wheels of a side.
+Missed = Literal["gap", "gyro", "way", "turn", "left", "right"]
 RATIO, TRACK, SCALE, GYRO = PARAMETERS = range(4)
 MISSED: dict[Missed, int] = {cause: len(PARAMETERS) + i for i, cause in enumerate(get_args(Missed))}
 CAUSES = len(PARAMETERS) + len(MISSED)
@@ -302,14 +303,17 @@ class Uncertainty(Struct):
             self._bend()
         self._publish()
 
-    def forgive(self, cause: Missed) -> None:
-        """Take the motion that the pose may have missed by a cause away: it is explained."""
-        i, bend = MISSED[cause], self.bend
-        for columns in (self.columns, bend.columns):
-            columns[i] = ORIGIN
-        for k in range(CAUSES):
-            bend.of_causes[CAUSES * i + k] = bend.of_causes[CAUSES * k + i] = 0.0, 0.0
-        self._publish()
+    def forgive(self) -> None:
+        """Take away what the wheels may have missed of their commands: it is explained."""
+        bend, none = self.bend, (0.0, 0.0)
+        for i in (MISSED["way"], MISSED["turn"]):
+            if self.columns[i] == ORIGIN:
+                continue
+            self.columns = [*self.columns]
+            self.columns[i] = bend.columns[i] = ORIGIN
+            for k in range(CAUSES):
+                bend.of_causes[CAUSES * i + k] = bend.of_causes[CAUSES * k + i] = none
+            self._publish()
 
     def set_twist(
         self, model: ErrorModel, twist: Twist, step: RadPerS, slips: bool, gyro: float | None
