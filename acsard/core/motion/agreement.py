@@ -217,8 +217,9 @@ class Agreement(Struct):
         elif contradiction:
             doubt = compared.gyro - compared.wheels
         elif compared is self.long and off > max(UNCLAIMED_SHARE * size, std + lag):
-            doubt = compared.gyro - compared.wheels - self.claimed
-            self.claimed += doubt
+            claim = max(-SHARE * size, min(compared.gyro - compared.wheels, SHARE * size))
+            doubt = claim - self.claimed
+            self.claimed = claim
         elif bias:
             doubt = bias * self.steady.seconds
         if contradiction:
