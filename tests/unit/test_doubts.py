@@ -35,7 +35,9 @@ class Bench:
             turned = self.angle - before
             shown = gain * turned
             self.off += turned - shown
-            self.doubt += self.trail.follow(command, shown, STEP_S, LAG_S, self.count)
+            self.trail.follow(command, shown, STEP_S, LAG_S)
+            if self.trail.ends(self.count):
+                self.doubt += self.trail.take(LAG_S, self.count)
 
     def rest(self) -> bool:
         self.trail.rest(LAG_S, self.count)

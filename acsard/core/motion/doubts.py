@@ -48,8 +48,8 @@ class Trail(Struct):
     largest: Rad = 0.0  # of both, since they were 0
     differs: bool = False  # more than any delay explains: said until the pose is set
 
-    def follow(self, command: RadPerS, angle: Rad, s: Seconds, lag: Seconds, count: Rad) -> Rad:
-        """Add a motion, and return what is in doubt now, as one standard deviation."""
+    def follow(self, command: RadPerS, angle: Rad, s: Seconds, lag: Seconds) -> None:
+        """Add a motion to the open step."""
         lag, keep = lag / 2, math.exp(-2 * s / lag)
         behind = self.expected - command
         self.expected = command + behind * keep
@@ -57,15 +57,24 @@ class Trail(Struct):
         self.due += command * s + behind * lag * (1.0 - keep)
         self.shown += angle
         self.seconds += s
-        more, size = self.due - self.shown, max(abs(self.due), abs(self.shown))
-        disagrees = abs(more) > AGREEMENT * size + NOISE_COUNTS * count
-        if not disagrees and size < STEP_COUNTS * count and self.seconds < STEP_S:
-            return 0.0
-        keep = 1.0 / (1.0 + self.seconds / MEMORY_S) if size else 1.0
-        self.recent = keep * self.recent + abs(self.due)
+
+    def disagrees(self, count: Rad) -> bool:
+        size = max(abs(self.due), abs(self.shown))
+        return abs(self.due - self.shown) > AGREEMENT * size + NOISE_COUNTS * count
+
+    def ends(self, count: Rad) -> bool:
+        """Return whether the open step is long enough for a comparison."""
+        size = max(abs(self.due), abs(self.shown))
+        return self.disagrees(count) or size >= STEP_COUNTS * count or self.seconds >= STEP_S
+
+    def take(self, lag: Seconds, count: Rad) -> Rad:
+        """End the step, and return what is in doubt now, as one standard deviation."""
+        more, disagrees, size = self.due - self.shown, self.disagrees(count), abs(self.due)
+        keep = 1.0 / (1.0 + self.seconds / MEMORY_S) if size or self.shown else 1.0
+        self.recent = keep * self.recent + size
         self.short = keep * self.short + more
         self.due = self.shown = self.seconds = 0.0
-        most = SHARE * self.recent + (DELAY_S + 2 * lag) * self.fastest + COUNTS * count
+        most = SHARE * self.recent + (DELAY_S + lag) * self.fastest + COUNTS * count
         self.differs |= abs(self.short) > most
         if disagrees:
             self.astray += more
@@ -141,20 +150,22 @@ class Doubts(Struct):
         for trail, side, commanded in zip(trails, wheels.sides, self.commanded, strict=True):
             if s <= 0.0:
                 break
-            angle, missed = (used[side.front] + used[3 - side.front]) / 2, 0.0
+            angle = (used[side.front] + used[3 - side.front]) / 2
             rests = all(wheels.wheels[i].rested for i in side.wheels)
             if rests:
                 trail.rest(lag, count)
             elif self.unknown:
                 trail.restart(angle / s)
             else:
-                missed = trail.follow(commanded / s, angle, s, lag, count)
+                trail.follow(commanded / s, angle, s, lag)
             explained = explained and rests and not trail.largest
-            if missed:
-                astray = plus(astray, of_side(side.front, missed))
             if side.out >= 0 or side.slip_s > 0.0:
                 half = (rolled[side.front] - rolled[side.rear]) / 2
                 wheels_astray.append((side.name, of_side(side.front, half)))
+        # One side alone would be in doubt of a turn.
+        if self.left.ends(count) or self.right.ends(count):
+            left, right = self.left.take(lag, count), self.right.take(lag, count)
+            astray = right, left, left, right
         self.commanded, self.seconds, self.unknown = (0.0, 0.0), 0.0, False
         self.rolled = self.repaired = AT_REST
         return Found(astray, wheels_astray, explained)
