@@ -39,8 +39,8 @@ LinkCode = Literal[
 
 # Why the pose may be far off although the link is up.
 PoseCode = Literal[
-    "counts_and_speeds_differ", "encoder_counts_missing", "coarse_encoder", "gyro_disagrees",
-    "not_calibrated",
+    "counts_and_speeds_differ", "wheels_and_commands_differ", "encoder_counts_missing",
+    "coarse_encoder", "gyro_disagrees", "not_calibrated",
 ]  # fmt: skip
 
 # This computer or the built-in simulator is to blame.
@@ -367,6 +367,11 @@ counts_and_speeds_differ
     firmware computes wrong speeds; the pose uses the counts, and its uncertainty the difference:
     -> write the counts per turn of a wheel that `acsard mcu check` shows; if they are right,
     correct the speeds in the firmware
+wheels_and_commands_differ
+    the wheels report another motion than was commanded, so the motors are blocked, too weak or too
+    strong, or the board reports wrong speeds; the pose follows the wheels:
+    -> measure a straight drive with a tape; if the pose is wrong, correct wheel_radius or the
+    speeds in the firmware, else the speed control of the motors; set_pose ends this doubt
 encoder_counts_missing
     the speeds jump as those of coarse encoders do, and mcu.encoder_counts is not set, so the
     heading drifts, and damaged lines are not noticed:

@@ -14,7 +14,7 @@ from typing import assert_never, cast
 
 from msgspec.structs import replace
 
-from acsard.core.codes import Reason, RefusalCode, reason
+from acsard.core.codes import Reason, RefusalCode, reason, sentence
 from acsard.core.config.live import Changes, changed, describe_changes
 from acsard.core.config.parsing import ConfigError
 from acsard.core.config.settings import Config, LimitsConfig
@@ -442,7 +442,12 @@ class Robot:
         silent = passed > self.link_setup.covered_s
         late = silent or state.session.steps.step_s > WRITE_PAUSE_S
         wheels.unseen = passed if late else 0.0
+        doubts = state.odometry.doubts
+        doubted = doubts.differs
         estimate = state.odometry.fold(line, checks, self.model)
+        if doubts.differs and not doubted:
+            why = sentence("wheels_and_commands_differ")
+            events.append(Event("pose_doubtful", why.text, "warning", code=why.code))
         if wheels.fault is not None:
             self._fault(wheels.fault, now, events)
         if wheels.gives_up:

@@ -84,6 +84,8 @@ def summary(robot: Robot, now_ns: Ns) -> Snapshot:
 def _pose_doubt(robot: Robot, gyro: GyroStatus) -> PoseCode | Literal[""]:
     if code := robot.state.session.pose_warning.code:
         return code
+    if robot.state.odometry.doubts.differs:
+        return "wheels_and_commands_differ"
     if gyro.does == "disagrees":
         return "gyro_disagrees"
     config = robot.config

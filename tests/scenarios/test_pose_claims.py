@@ -125,6 +125,24 @@ def test_a_gyro_that_contradicts_the_wheels_is_a_doubt_and_is_said(
         assert "gyro_disagrees" in doubts
 
 
+@pytest.mark.variations(6)
+@pytest.mark.parametrize("share", [0.9, 1.07, 1.1])
+@pytest.mark.parametrize("std", ["uncalibrated", 0.02])
+@four_and_two
+def test_a_share_of_a_turn_by_which_gyro_and_wheels_may_differ_is_claimed(
+    share: float, std: Any, wheels: WheelMap
+) -> None:
+    odometry = OdometryConfig(gyro=True, wheel_separation_multiplier_std=std)
+    gyro = ImperfectGyro(bias=0.01, noise=0.005, share=share)
+    world = World(Config(mcu=McuConfig(wheels=wheels), odometry=odometry), gyro=gyro)
+    world.run(2.0)
+    world.drive(0.2, 0.3, 0.5)
+    world.hold(0.1, 1.0, 6.0)
+    for _ in range(9):
+        world.hold(0.1, 1.0, 1.0)
+        assert heading_sigmas(world) < 2.0
+
+
 @pytest.mark.parametrize("counts", [16, 20, 48, 96, 360])
 @pytest.mark.parametrize("period", [0.01, 0.02, 0.1])
 @four_and_two

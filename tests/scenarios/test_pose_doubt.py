@@ -51,8 +51,8 @@ def test_counts_that_contradict_the_speeds_are_a_doubt_and_a_warning_has_both_va
     robot.run(0.5)
     robot.drive(0.5, 0.0, 6.0)
     assert robot.state.pose_doubt == "counts_and_speeds_differ"
-    (event,) = [event for event in robot.events if event.name == "pose_doubtful"]
-    assert event.code == "counts_and_speeds_differ"
+    (event,) = [event for event in robot.events if event.code == "counts_and_speeds_differ"]
+    assert event.name == "pose_doubtful"
     assert re.search(r"[\d.]+ rad by its counts and [\d.]+ rad by its speeds in 5.\d s", event.text)
     assert "mcu.encoder_counts is wrong, or the firmware" in event.text
     robot.hold(0.4, 0.8, 4.0)

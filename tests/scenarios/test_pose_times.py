@@ -9,7 +9,14 @@ from typing import Literal
 import numpy as np
 import pytest
 
-from acsard.core.config.settings import Config, ControlConfig, McuConfig, SimConfig, WheelMap
+from acsard.core.config.settings import (
+    Config,
+    ControlConfig,
+    McuConfig,
+    OdometryConfig,
+    SimConfig,
+    WheelMap,
+)
 from acsard.core.values import Estimate, Received
 from tests.scenarios.world import World
 from tests.stepped import Outputs
@@ -51,12 +58,15 @@ class Gap:
     """A checked link on which a gap in the feedback begins while the robot drives at a speed."""
 
     def __init__(self, speed: float) -> None:
-        self.world, self.speed = World(Config(sim=FINE, mcu=McuConfig(link_check="on"))), speed
+        sure = OdometryConfig(distance_variance_per_metre=1e-6, distance_scale_std=0.0)
+        config = Config(sim=FINE, mcu=McuConfig(link_check="on"), odometry=sure)
+        self.world, self.speed = World(config), speed
         self.estimates: list[Estimate] = []
         self.world.watch = lambda outputs: self.estimates.extend(outputs.estimates)
         self.world.run(1.5)
+        self.variance = self.estimates[-1].covariance.xx
         self.world.drive(speed, seconds=2.0)
-        self.before, self.variance = self.off, self.estimates[-1].covariance.xx
+        self.before = self.off
 
     @property
     def off(self) -> float:
@@ -64,7 +74,7 @@ class Gap:
         return self.world.state.x - self.world.mcu.vehicle.pose.x
 
     def end(self) -> tuple[float, float]:
-        """Stop the robot and end the gap. Return the gap's error and its standard deviation, m."""
+        """Stop the robot and end the gap. Return the gap's error and the standard deviation, m."""
         self.world.hold(0.0, seconds=1.5)
         grown = self.estimates[-1].covariance.xx - self.variance
         return self.off - self.before, math.sqrt(grown)

@@ -24,6 +24,9 @@ COUNTS_M2, COUNTS_RAD2 = 2e-3, 1e-3
 """Allowed beside the bound, for the place of a wheel within an encoder count of 1/96 turn, and for
 lines that come late, whose time is doubted."""
 
+DELAY_S = 2.0
+"""What a motor may seem to be late by is in doubt: at most about the motion of this time."""
+
 UNKNOWN_RAD = 1.0
 """Deviation of the heading from which on the position is not judged: terms of second order, which
 are larger than those of first order then, make it far too uncertain rather than too certain."""
@@ -70,6 +73,8 @@ class Spread:
         self._last: Estimate | None = None
         self._place = self._yaw = 0.0
         """Standard deviation of the position, m, and of the heading, rad: the bounds."""
+        self._late = self._turned = 0.0
+        """The motion in about the last `DELAY_S`, m and rad."""
 
     def forget(self) -> None:
         """Note that the next estimate's covariance changes for another reason than motion."""
@@ -103,8 +108,11 @@ class Spread:
         self._place = math.sqrt(place**2 + self._by_metre * rolled)
         yaw = self._yaw + RATIO * way / self._track + self._track_std * turn
         self._yaw = math.sqrt(yaw**2 + self._yaw_by_metre * rolled + self._yaw_by_radian * turn)
-        wide = self._yaw < UNKNOWN_RAD and xx + yy > ROOM * self._place**2 + COUNTS_M2
-        if wide or yawyaw > ROOM * self._yaw**2 + COUNTS_RAD2:
+        keep = math.exp((last[0] - estimate[0]) / (DELAY_S * NS))
+        self._late, self._turned = keep * self._late + way, keep * self._turned + turn
+        late, turned = self._late**2 + COUNTS_M2, self._turned**2 + COUNTS_RAD2
+        wide = self._yaw < UNKNOWN_RAD and xx + yy > ROOM * self._place**2 + late
+        if wide or yawyaw > ROOM * self._yaw**2 + turned:
             raise BrokenError(
                 "the covariance grows by motion only", now_ns,
                 f"variances {xx + yy:.3g} m2 and {yawyaw:.3g} rad2, "

@@ -201,7 +201,7 @@ def test_a_robot_that_obeys_is_as_certain_with_long_lines_as_with_short_ones(
     wheels: WheelMap,
 ) -> None:
     long, short = accelerated(wheels, 0.1), accelerated(wheels, 0.01)
-    assert long.covariance.xx == pytest.approx(short.covariance.xx, rel=0.2)
+    assert long.covariance.xx < 1.2 * short.covariance.xx
 
 
 @each("wheels", MAPS)

@@ -40,7 +40,6 @@ class Bench:
         self.wheels = new_wheels(len(wheels.names))
         self.events: list[str] = []
         self.faults: list[str] = []
-        self.missed: list[tuple[str, float]] = []  # sides that may have turned, and how far, rad
         self.pushes = self.gave_up = 0
 
     def run(
@@ -77,8 +76,6 @@ class Bench:
                 self.faults.append(wheels.fault.code)
                 if until_fault:
                     break
-            possible = wheels.possible_motion((0.0, 0.0, 0.0, 0.0))
-            self.missed += [(side, angles[0]) for side, angles in possible]
         return time_s
 
     def driven(self, speed: float = 10.0) -> Bench:
@@ -275,17 +272,6 @@ def test_what_sound_robots_do_is_no_fault() -> None:
     blind.run(-10.0, 10.0, 5.0)
     assert slow.faults == lowered.faults == again.faults == blind.faults == []
     assert again.events == blind.events == []
-
-
-# a turn that both wheels of a side may have missed
-
-
-@each("wheels", MAPS)
-def test_all_wheels_of_a_side_that_report_no_turn_may_have_turned(wheels: WheelMap) -> None:
-    bench = Bench(wheels=wheels).driven()
-    bench.run(WheelSpeeds(0.0, 10.0, 10.0, 0.0), 10.0, 1.0)
-    assert {side for side, _ in bench.missed} == {"right"}
-    assert sum(angle for _, angle in bench.missed) == pytest.approx(10.0, rel=0.1)
 
 
 # wheels that the pose leaves out

@@ -24,6 +24,8 @@ BLOCK_S, MAX_BLOCK = 0.2, 0.5  # s, or rad of difference: of the sums that are c
 # Old blocks count less: on straights after this time, and in turns after this angle.
 STRAIGHT_MEMORY_S, TURN_MEMORY = 30.0, 10.0
 SHARE = 0.15  # of a turn, by which gyro and wheels may differ on any floor after a calibration
+# The heading claims a larger share, which may be the gyro's scale, beside a deviation.
+UNCLAIMED_SHARE = 0.05
 AGREES = 0.5  # deviations, below which a short comparison restarts: a new fault then shows at once
 MARGIN = 0.02  # rad, standard deviation of the wheels' turn by encoder counts and vibration
 MAX_DELAY_S = 0.05  # a gyro with this delay does not contradict the wheels
@@ -144,6 +146,7 @@ class Agreement(Struct):
     short: Compared = field(default_factory=Compared)  # turns; the test of a gyro, too
     long: Compared = field(default_factory=Compared)
     steady: Steady = field(default_factory=Steady)
+    claimed: Rad = 0.0  # of the difference in `long`
 
     def forget(self) -> None:
         """Forget what was compared; the verdict stays."""
@@ -152,7 +155,7 @@ class Agreement(Struct):
 
     def _forget_turns(self) -> None:
         self.straight, self.short, self.long = Compared(), Compared(), Compared()
-        self.steady = Steady()
+        self.steady, self.claimed = Steady(), 0.0
 
     def add(
         self, wheels: Rad, gyro: Rad, way: Metres, dt: Seconds, noise: float
@@ -194,7 +197,9 @@ class Agreement(Struct):
             compared.add(block, math.exp(-block.seconds / STRAIGHT_MEMORY_S))
         else:
             compared, lag = self.long, MAX_DELAY_S * turned / block.seconds
-            compared.add(block, math.exp(-turned / TURN_MEMORY))
+            keep = math.exp(-turned / TURN_MEMORY)
+            compared.add(block, keep)
+            self.claimed *= keep
             self.short.add(block, 1.0)
             off, std = self.short.difference(claims, bias_variance)
             share = SHARE * abs(self.short.wheels)
@@ -203,14 +208,18 @@ class Agreement(Struct):
             elif off > DEVIATIONS * std + lag:
                 compared = self.short
         off, std = compared.difference(claims, bias_variance)
-        share = SHARE * abs(compared.wheels)
-        contradiction, doubt = off > max(share, DEVIATIONS * std + lag), 0.0
+        size = abs(compared.wheels)
+        contradiction, doubt = off > max(SHARE * size, DEVIATIONS * std + lag), 0.0
         self.steady.add(block)
         bias = self.steady.bias(claims, bias_variance)
         if self.disagrees_s > 0.0:
             doubt = block.gyro - block.wheels
         elif contradiction:
             doubt = compared.gyro - compared.wheels
+        elif compared is self.long and off > max(UNCLAIMED_SHARE * size, std + lag):
+            claim = max(-SHARE * size, min(compared.gyro - compared.wheels, SHARE * size))
+            doubt = claim - self.claimed
+            self.claimed = claim
         elif bias:
             doubt = bias * self.steady.seconds
         if contradiction:

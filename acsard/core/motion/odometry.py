@@ -17,11 +17,11 @@ from msgspec import Struct, field
 
 from acsard.core.link.feedback import MAX_FILLED_GAP_S, Line
 from acsard.core.motion.consistency import ConsistencyChecks
+from acsard.core.motion.doubts import Doubts
 from acsard.core.motion.gaps import AT_REST, LONG_S, Rolled, Skipped, plus, rolled_over, times
 from acsard.core.motion.gyro import REST_S
 from acsard.core.motion.kinematics import on_arc
 from acsard.core.motion.uncertainty import (
-    MISSED_STD,
     UPDATE_S,
     ErrorModel,
     Path,
@@ -43,8 +43,6 @@ from acsard.core.values import (
     WheelSpeeds,
 )
 
-RECENT_S = 2.0  # within which a wheel that is to be doubted is found out
-
 
 class Odometry(Struct):
     """Pose, covariance and angles of the wheels. What is derived from settings is in `model`."""
@@ -56,8 +54,8 @@ class Odometry(Struct):
     speeds: WheelSpeeds = STILL  # in the last line
     positions: Wheels4 = AT_REST  # of the wheels, rad
     travelled: Metres = 0.0  # since the daemon started, forwards plus backwards
-    recent: Metres = 0.0  # the same, in about the last `RECENT_S`
     skipped: Skipped = field(default_factory=Skipped)
+    doubts: Doubts = field(default_factory=Doubts)
     held: Wheels4 = AT_REST  # rad at rest; for the pose beyond two counts, or in a drive
     rested: Seconds = math.inf  # of zero speeds, without gaps
     # The pose was set then, after the last line: a part of the motion since that line came before.
@@ -82,6 +80,7 @@ class Odometry(Struct):
         self.positions, self.held = plus(self.positions, self.held), AT_REST
         self.pose = Pose(pose.x, pose.y, math.remainder(pose.yaw, math.tau))
         self.path, self.uncertainty = Path(), Uncertainty.initial(model, self.pose)
+        self.doubts.forget()
         self.set_ns = at_ns
 
     def fold(self, line: Line, checks: ConsistencyChecks, model: ErrorModel) -> Estimate:
@@ -124,11 +123,11 @@ class Odometry(Struct):
             distance, angle = moved(plus(wheels.believed(rolled), wheels.repair))
         else:
             distance, angle = moved(rolled)
+        self.doubts.add(wheels, rolled, seconds)
         variance = 0.0
         if turn is not None:
             angle, angular, variance = turn.angle, turn.rate, turn.variance
         self.travelled += abs(distance)
-        self.recent = (self.recent + abs(distance)) * RECENT_S / (RECENT_S + seconds)
         last, self.twist, self.speeds = self.twist, Twist(linear, angular), speeds
 
         pose, path, uncertainty = self.pose, self.path, self.uncertainty
@@ -150,9 +149,8 @@ class Odometry(Struct):
             self.late = Twist(
                 self.late.linear + linear * line.late, self.late.angular + angular * line.late
             )
-        doubts = wheels.possible_motion(rolled)
         due |= line.doubt is not None or (turn is not None and turn.doubt != 0.0)
-        if due or gap or doubts or self.set_ns or uncertainty.seconds >= UPDATE_S:
+        if due or gap or self.set_ns or uncertainty.seconds >= UPDATE_S:
             uncertainty.update(model, self.pose, self.path, slips=slips, by_gyro=turn is not None)
             rate_variance = None if turn is None else turn.rate_variance
             if at_rest:
@@ -176,14 +174,17 @@ class Odometry(Struct):
                 uncertainty.miss("gap", distance, 0.0 if turn is not None else angle, heading)
             if turn is not None and turn.doubt:
                 uncertainty.miss("gyro", 0.0, turn.doubt, heading)
-            for side, angles in doubts:
+            found = self.doubts.update(wheels, model.feedback.response_time, model.wheel_count)
+            if found.explained:
+                uncertainty.forgive()
+            turns = 0.0 if turn is not None else 1.0
+            if found.astray != AT_REST:
+                distance, angle = model.kinematics.moved(found.astray)
+                uncertainty.miss("way", distance, 0.0, heading)
+                uncertainty.miss("turn", 0.0, turns * angle, heading)
+            for side, angles in found.wheels:
                 distance, angle = model.kinematics.moved(angles)
-                angle = 0.0 if turn is not None else angle
-                uncertainty.miss(side, MISSED_STD * distance, MISSED_STD * angle, heading)
-                # With a turn that was missed, too, the distance may have been to any side, and so
-                # the way in which it was missed.
-                aside = (MISSED_STD * (abs(distance) + self.recent)) ** 2 * min(1.0, angle**2)
-                uncertainty.doubt(aside, 0.0, aside, heading)
+                uncertainty.miss(side, distance, turns * angle, heading)
         return Estimate(
             line.at, self.pose, self.twist, uncertainty.covariance, uncertainty.twist,
             self.positions, speeds, line.asked_ns, line.heard_ns,

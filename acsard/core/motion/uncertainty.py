@@ -16,7 +16,7 @@ that was missed, or a heading of which nothing is known, the robot may be anywhe
 from __future__ import annotations
 
 import math
-from typing import Literal
+from typing import Literal, get_args
 
 from msgspec import Struct, field
 
@@ -59,9 +59,6 @@ SLIP_FACTOR = 100.0  # on the variances of a step and of the twist while the whe
 PUSH_SPEED, PUSH_TURN = 1.0, 0.5  # m/s and rad/s
 MOST_AWAY, MOST_TURNED = 10.0, 3.2  # m and rad: then it may be anywhere near, in any direction
 
-# Deviation of a motion that the pose has missed with the probability 1/2.
-MISSED_STD = math.sqrt(0.5)
-
 Vector = tuple[float, float, float]  # x, y (m) and yaw (rad) of an error
 
 # Error of a step for one standard deviation: of the distance per m and per rad, of the turn per m
@@ -72,10 +69,11 @@ ORIGIN: Vector = (0.0, 0.0, 0.0)
 NO_EFFECT: Effect = (0.0, 0.0, 0.0, 0.0)
 
 # Causes of an error that do not average out. The motion that the pose may have missed is that of
-# gaps, of wheels of a side that are in doubt, and the difference of the turns by gyro and wheels.
-Missed = Literal["gap", "left", "right", "gyro"]
+# gaps, and the differences of gyro and wheels, of the wheels and their commands (`way` and `turn`),
+# and of the wheels of a side.
+Missed = Literal["gap", "gyro", "way", "turn", "left", "right"]
 RATIO, TRACK, SCALE, GYRO = PARAMETERS = range(4)
-MISSED: dict[Missed, int] = {"gap": 4, "left": 5, "right": 6, "gyro": 7}
+MISSED: dict[Missed, int] = {cause: len(PARAMETERS) + i for i, cause in enumerate(get_args(Missed))}
 CAUSES = len(PARAMETERS) + len(MISSED)
 
 
@@ -132,7 +130,6 @@ class ErrorModel:
             by_gyro[SCALE] = (1.0, 0.0, 0.0, 0.0)
         missed = [none] * len(MISSED)
         self.effects: tuple[list[Effect], list[Effect]] = by_wheels + missed, by_gyro + missed
-        self.bending = [k for k in PARAMETERS if any(by_wheels[k]) or any(by_gyro[k])]
 
         # Independent errors of the speeds; each side is the mean of its wheels.
         self.of_speed = (
@@ -204,9 +201,9 @@ class Bend(Struct):
     rolled: Metres = 0.0  # since then
     # xx, xy and yy of the errors [e, n] / 2, which are independent in each stretch.
     noise: Vector = (0.0, 0.0, 0.0)
-    # x and y of the sums of [J_i, W_k] / 2, m, for all causes i and parameters k.
+    # x and y of the sums of [J_i, W_k] / 2, m, for all causes i and k.
     of_causes: list[tuple[float, float]] = field(
-        default_factory=lambda: [(0.0, 0.0)] * (CAUSES * len(PARAMETERS))
+        default_factory=lambda: [(0.0, 0.0)] * (CAUSES * CAUSES)
     )
     added: Vector = (0.0, 0.0, 0.0)  # to xx, xy and yy of the pose
 
@@ -270,7 +267,7 @@ class Uncertainty(Struct):
         self.columns, bend = columns, self.bend
         bend.rolled += abs(distance) + model.track / 2 * abs(turn)
         if bend.rolled > BEND_M:
-            self._bend(model)
+            self._bend()
         self.astray += abs(distance) * self._share_astray()
         self._publish()
 
@@ -300,7 +297,23 @@ class Uncertainty(Struct):
         c, s = math.cos(heading), math.sin(heading)
         self.columns = [*self.columns]
         self.columns[i] = x + c * distance, y + s * distance, yaw + turn
+        self.astray += abs(distance) * self._share_astray()
+        self.bend.rolled += 2 * abs(distance)
+        if self.bend.rolled > BEND_M:
+            self._bend()
         self._publish()
+
+    def forgive(self) -> None:
+        """Take away what the wheels may have missed of their commands: it is explained."""
+        bend, none = self.bend, (0.0, 0.0)
+        for i in (MISSED["way"], MISSED["turn"]):
+            if self.columns[i] == ORIGIN:
+                continue
+            self.columns = [*self.columns]
+            self.columns[i] = bend.columns[i] = ORIGIN
+            for k in range(CAUSES):
+                bend.of_causes[CAUSES * i + k] = bend.of_causes[CAUSES * k + i] = none
+            self._publish()
 
     def set_twist(
         self, model: ErrorModel, twist: Twist, step: RadPerS, slips: bool, gyro: float | None
@@ -347,7 +360,7 @@ class Uncertainty(Struct):
         self.in_play = max(-model.play, min(off, model.play))
         return abs(off - self.in_play)
 
-    def _bend(self, model: ErrorModel) -> None:
+    def _bend(self) -> None:
         # Composes the error e of the path before a stretch with its own w (Baker, Campbell,
         # Hausdorff): log(exp(e) exp(w)) = e + w + [e, w] / 2 + ... The bracket has no yaw. Both
         # have noise, and the effects J and W of the causes, which are the same in each stretch.
@@ -358,27 +371,29 @@ class Uncertainty(Struct):
         j = [(x - dy * yaw, y + dx * yaw, yaw) for x, y, yaw in bend.columns]
         self.bend = new = Bend(p, columns, self.pose, 0.0, bend.noise, bend.of_causes, bend.added)
         total = _total(before, j)
+        bending = [k for k, column in enumerate(columns) if column != ORIGIN]
         if self.covariance.yawyaw > MAX_HEADING_VARIANCE:
             return
         noise_xx, noise_xy, noise_yy = _bracketed(total, _difference(p, before))
         xx, xy, yy = bend.noise
         new.noise = xx, xy, yy = xx + noise_xx / 4, xy + noise_xy / 4, yy + noise_yy / 4
-        sums, parameters = bend.of_causes, len(PARAMETERS)
+        sums = bend.of_causes
         mean_x = mean_y = 0.0
-        for k in model.bending:
+        for k in bending:
             (ax, ay, ayaw), (bx, by, byaw) = columns[k], j[k]
             wx, wy, wyaw = ax - bx, ay - by, ayaw - byaw
-            for i, (x, y, yaw) in enumerate(j):
-                sum_x, sum_y = sums[parameters * i + k]
+            for i in bending:
+                x, y, yaw = j[i]
+                sum_x, sum_y = sums[CAUSES * i + k]
                 sum_x += (y * wyaw - yaw * wy) / 2
                 sum_y += (yaw * wx - x * wyaw) / 2
-                sums[parameters * i + k] = sum_x, sum_y
+                sums[CAUSES * i + k] = sum_x, sum_y
         # With A_ik, these sums, and independent unit normals p, E[(p' A p)^2] is the square of the
         # trace, plus the sums of A_ik^2 and of A_ik A_ki.
-        for k in model.bending:
-            for i in range(CAUSES):
-                x, y = sums[parameters * i + k]
-                of_x, of_y = sums[parameters * k + i] if i < parameters else (0.0, 0.0)
+        for k in bending:
+            for i in bending:
+                x, y = sums[CAUSES * i + k]
+                of_x, of_y = sums[CAUSES * k + i]
                 xx, xy, yy = xx + x * (x + of_x), xy + x * (y + of_y), yy + y * (y + of_y)
                 if i == k:
                     mean_x, mean_y = mean_x + x, mean_y + y

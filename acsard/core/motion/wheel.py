@@ -37,13 +37,12 @@ class Wheel(Struct):
     rolled: Rad = 0.0  # either way, while it is faster or slower than expected
     due: Rad = 0.0  # what was due meanwhile
     timing: Rad = 0.0  # by which a sound wheel may be earlier or later than expected
-    missed: Rad = 0.0  # expected minus measured since both agreed
     rested: bool = True  # and was not commanded since then
     rest_s: Seconds = 0.0
     rest_angle: Rad = 0.0
     fast_s: Seconds = 0.0  # faster than the limiter allows
     fast_angle: Rad = 0.0  # rolled beyond that
-    doubted: bool = False  # by a latched fault, until it is cleared: the pose may have all of it
+    latched: bool = False  # by a fault, until it is cleared
     reported: RadPerS = 0.0  # in the last line
     same_s: Seconds = 0.0  # for which it repeats this speed
     warning: Code | None = None
@@ -58,7 +57,7 @@ class Wheel(Struct):
         if moves and self.rested:
             # A wheel rests with the robot: under way, a side that stands is commanded to.
             self.obedience.forget()
-            self.missed, self.rested, self.rest_s, self.rest_angle = 0.0, False, 0.0, 0.0
+            self.rested, self.rest_s, self.rest_angle = False, 0.0, 0.0
         if not -COMMANDED < command < COMMANDED:
             self.rest_s = self.rest_angle = 0.0
         elif not self.rested:
@@ -80,14 +79,9 @@ class Wheel(Struct):
             self.obedience.forget()
 
     def follow(
-        self, side: Side, expected: Rad, s: Seconds, share: float, noise: RadPerS,
-        bounds: list[Bounds], least: Rad,
-    ) -> Rad:  # fmt: skip
-        """End a step of `s` seconds in which it was `expected` to turn so far.
-
-        `bounds` are of the smoothed speeds, whose noise is `noise`. Returns what it turned too
-        little.
-        """
+        self, side: Side, s: Seconds, share: float, noise: RadPerS, bounds: list[Bounds], least: Rad
+    ) -> None:
+        """End a step of `s` seconds, with `bounds` of the smoothed speeds and their `noise`."""
         obedience, angle, largest = self.obedience, self.turned, side.due.most
         speed = self.speed = self.speed + (angle - self.speed * s) * share
         self.expected = side.smooth[-1]
@@ -103,11 +97,9 @@ class Wheel(Struct):
         else:
             self.fast_s = self.fast_angle = 0.0
         obedience.add(sure, turns, bounds, s, least + self.timing)
-        more, difference = expected - angle, abs(speed - self.expected)
+        difference = abs(speed - self.expected)
         agrees = difference <= AGREEMENT * max(turns, abs(self.expected))
         self.agrees = agrees or difference < AGREED_NOISE * noise
-        self.missed = 0.0 if self.agrees else self.missed + more
-        return more
 
     def too_fast(self, largest: RadPerS, count: Rad) -> bool:
         """Whether it has been faster than the limiter allows for long enough."""

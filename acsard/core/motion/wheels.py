@@ -35,7 +35,6 @@ from acsard.core.motion.sides import (
     PARTNER_S_PER_RAD,
     Block,
     Side,
-    SideName,
 )
 from acsard.core.motion.standstill import COMMANDED, Standstill
 from acsard.core.motion.wheel import REST_S, Wheel
@@ -101,7 +100,6 @@ class Wheels(Struct):
     gives_up: bool = False  # no wheel begins to move, so each sender must be neutral again
     excludes: bool = False
     slips: bool = False  # the wheels of a side contradict each other
-    missed: tuple[tuple[SideName, Wheels4], ...] = ()  # by both wheels of a side
     repair: Wheels4 = NOTHING  # what the pose still has of a wheel that is left out now, rad
     fault: Reason | None = None
     pushed: str = ""
@@ -168,7 +166,7 @@ class Wheels(Struct):
         for side in self.sides:
             side.forget()
         for wheel in self.wheels:
-            wheel.doubted = False
+            wheel.latched = False
         self._begin()
 
     def believed(self, wheels: Wheels4) -> Wheels4:
@@ -180,23 +178,6 @@ class Wheels(Struct):
             if side.out >= 0:
                 values[side.out] = wheels[side.front + side.rear - side.out]
         return _wheels4(values)
-
-    def possible_motion(self, wheels: Wheels4) -> list[tuple[SideName, Wheels4]]:
-        """Return, by side, angles that may be true and that the pose leaves out, rad.
-
-        Call this once for each line. A wheel that is left out may be blocked, or its motor may be
-        reversed; two wheels of a side that do not obey may have two faulty encoders.
-        """
-        if not (self.excludes or self.missed):
-            return []
-        found, self.missed = list(self.missed), ()
-        for side in self.sides:
-            out, other = side.out, side.front + side.rear - side.out
-            if out >= 0 and side.why != "repeats":
-                values = [0.0] * 4
-                values[out] = wheels[out] - wheels[other] - self.repair[out]
-                found.append((side.name, _wheels4(values)))
-        return found
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -221,7 +202,7 @@ class Wheels(Struct):
         self.begins = True
         for wheel in self.wheels:
             wheel.speed, wheel.sure_speed, wheel.obedience = 0.0, 0.0, Obedience()
-            wheel.fast_s = wheel.fast_angle = wheel.missed = 0.0
+            wheel.fast_s = wheel.fast_angle = 0.0
         self.standstill.forget()
 
     def _end_block(
@@ -317,15 +298,11 @@ class Wheels(Struct):
             if size * SMOOTHED_S > SMOOTHED_COUNTS * count:
                 smoothed = SMOOTHED_COUNTS * count / size
             share = 1.0 / (smoothed + s)
-            whole = side.whole_angle
             side.remember(s, share, *speeds)
             noise = NOISE_COUNTS * count * share
             bounds = side.due.bounds(noise)
             for i in side.wheels:
-                wheel = self.wheels[i]
-                more = wheel.follow(side, whole, s, share, noise, bounds, least)
-                if wheel.doubted and more:
-                    self._doubt(i, more)
+                self.wheels[i].follow(side, s, share, noise, bounds, least)
         for i, wheel in enumerate(self.wheels):
             if not wheel.rested:
                 self._pace(i, wheel, count)
@@ -334,8 +311,6 @@ class Wheels(Struct):
             elif wheel.obedience.unexplained >= least:
                 fastest = max(fastest, abs(wheel.speed))
                 wheel.obedience.forget()
-        for side in self.sides:
-            self._miss(side, count)
         self.unreported_s += s
         if fastest and self.unreported_s >= REPEATED_S:
             self.unreported_s = 0.0
@@ -373,7 +348,7 @@ class Wheels(Struct):
 
     def _disobeys(self, i: int, wheel: Wheel) -> None:
         # One cause is enough: the robot stops.
-        if wheel.doubted or self._latch_swapped(i):
+        if wheel.latched or self._latch_swapped(i):
             return
         speed, command = wheel.speed, wheel.command
         due = self.sides[SIDE_OF[i]].due.in_direction_of(speed)
@@ -416,21 +391,8 @@ class Wheels(Struct):
         if self.fault is None:
             figures = f"(commanded {command:.2f}, measured {wheel.speed:.2f} rad/s)"
             self.fault = joined(reason(code, part=name, wheel=name, figures=figures))
-        if not wheel.doubted:
-            wheel.doubted = True
-            self._doubt(i, wheel.missed)
+        wheel.latched = True
         wheel.forget()
-
-    def _doubt(self, i: int, angle: Rad) -> None:
-        # What a wheel with a latched fault showed otherwise than expected, which the pose has. Of
-        # a wheel that is left out the pose has nothing, and `possible_motion` covers it.
-        if self.sides[SIDE_OF[i]].out == i:
-            return
-        values = [0.0] * 4
-        values[i] = angle
-        if len(self.wheels) < len(WHEELS):
-            values[3 - i] = angle
-        self.missed = (*self.missed, (self.sides[SIDE_OF[i]].name, _wheels4(values)))
 
     def _warn(self, i: int, wheel: Wheel, code: Code | None) -> None:
         if code == wheel.warning:
@@ -442,19 +404,6 @@ class Wheels(Struct):
         else:
             event = _warning(wheel.text(self.names[i]), code)
         self.events = (*self.events, event)
-
-    def _miss(self, side: Side, count: Rad) -> None:
-        one, other = self.wheels[side.front], self.wheels[side.rear]
-        # Quick motors stop before they are expected to.
-        still = -COMMANDED < side.command < COMMANDED
-        if side.out >= 0 or still or min(abs(one.missed), abs(other.missed)) <= count:
-            return
-        none = self.standstill.why is not None
-        if none or all(w.obedience.off > count + w.timing for w in (one, other)):
-            values = [0.0] * 4
-            values[side.front], values[3 - side.front] = one.missed, other.missed
-            one.missed = other.missed = 0.0
-            self.missed = (*self.missed, (side.name, _wheels4(values)))
 
     def _compare(self, block: Block, kinematics: Kinematics) -> None:
         if len(self.wheels) < len(WHEELS):

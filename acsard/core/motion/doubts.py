@@ -1,0 +1,180 @@
+"""Holds what the wheels show otherwise than it was commanded: the pose may have it wrong.
+
+Nothing tells a motor that does not obey from an encoder that lies. So the difference of a side and
+its command is in doubt at once, whatever the verdict on its wheels will be. A delay of the motor
+gives it back by the next rest, and only that takes the doubt away. What `AGREEMENT` allows may be a
+weak motor: this doubt is bounded, and beyond the bound `state` says it. Two wheels of a side that
+contradict each other are in doubt by half of their difference.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+from msgspec import Struct, field
+
+from acsard.core.motion.gaps import AT_REST, plus
+from acsard.core.motion.obedience import AGREEMENT
+from acsard.core.motion.sides import SideName
+from acsard.core.motion.wheels import Wheels
+from acsard.core.values import Rad, RadPerS, Seconds, Wheels4
+
+# A step is long enough for a comparison after these counts, or this time.
+STEP_COUNTS, STEP_S = 6.0, 1.0
+NOISE_COUNTS = 1.5  # of an angle
+
+# A difference is said beyond this share of the recent way, this time at the fastest speed, beside
+# the response time, and these counts.
+SHARE, DELAY_S, COUNTS = 0.05, 1.0, 2.0
+MEMORY_S = 30.0  # of driving
+# A delay of a motor takes at most the response time and the first time, at the fastest speed, and
+# gives all of it back by the next rest, but for the second time.
+TAKEN_S, LEFT_S = 0.6, 0.1
+
+
+class Trail(Struct):
+    """What one side shows otherwise than commanded, rad."""
+
+    expected: RadPerS = 0.0  # command behind half of the response time: a motor may be quicker
+    fastest: RadPerS = 0.0  # since the last rest
+    due: Rad = 0.0  # in the open step
+    shown: Rad = 0.0
+    seconds: Seconds = 0.0
+    recent: Rad = 0.0  # due in either direction, in `MEMORY_S`
+    short: Rad = 0.0  # due minus shown, in `MEMORY_S`
+    astray: Rad = 0.0  # due minus shown, beyond `AGREEMENT`
+    weak: Rad = 0.0  # due minus shown, within it, and bounded
+    largest: Rad = 0.0  # of both, since they were 0
+    differs: bool = False  # more than any delay explains: said until the pose is set
+
+    def follow(self, command: RadPerS, angle: Rad, s: Seconds, lag: Seconds) -> None:
+        """Add a motion to the open step."""
+        lag, keep = lag / 2, math.exp(-2 * s / lag)
+        behind = self.expected - command
+        self.expected = command + behind * keep
+        self.fastest = max(self.fastest, abs(self.expected))
+        self.due += command * s + behind * lag * (1.0 - keep)
+        self.shown += angle
+        self.seconds += s
+
+    def disagrees(self, count: Rad) -> bool:
+        size = max(abs(self.due), abs(self.shown))
+        return abs(self.due - self.shown) > AGREEMENT * size + NOISE_COUNTS * count
+
+    def ends(self, count: Rad) -> bool:
+        """Return whether the open step is long enough for a comparison."""
+        size = max(abs(self.due), abs(self.shown))
+        return self.disagrees(count) or size >= STEP_COUNTS * count or self.seconds >= STEP_S
+
+    def take(self, lag: Seconds, count: Rad) -> Rad:
+        """End the step, and return what is in doubt now, as one standard deviation."""
+        more, disagrees, size = self.due - self.shown, self.disagrees(count), abs(self.due)
+        keep = 1.0 / (1.0 + self.seconds / MEMORY_S) if size or self.shown else 1.0
+        self.recent = keep * self.recent + size
+        self.short = keep * self.short + more
+        self.due = self.shown = self.seconds = 0.0
+        most = SHARE * self.recent + (DELAY_S + lag) * self.fastest + COUNTS * count
+        self.differs |= abs(self.short) > most
+        if disagrees:
+            self.astray += more
+        else:
+            before, self.weak = self.weak, max(-most, min(self.weak + more, most))
+            more = self.weak - before
+        self.largest = max(self.largest, abs(self.astray + self.weak))
+        return more
+
+    def rest(self, lag: Seconds, count: Rad) -> None:
+        """Note that the side rests: a delay may explain all of the doubt."""
+        self.expected = self.due = self.shown = self.seconds = 0.0
+        fastest, self.fastest = self.fastest, 0.0
+        left = max(abs(self.astray + self.weak), abs(self.short)) - COUNTS * count
+        taken = self.largest - COUNTS * count
+        if left <= LEFT_S * fastest and taken <= (TAKEN_S + lag) * fastest and not self.differs:
+            self.astray = self.weak = self.largest = 0.0
+
+    def restart(self, speed: RadPerS) -> None:
+        """Note that nobody knows what is expected of a side with this speed."""
+        self.expected, self.due, self.shown, self.seconds = speed, 0.0, 0.0, 0.0
+
+    def forget(self) -> None:
+        self.astray = self.weak = self.largest = self.short = self.recent = 0.0
+        self.differs = False
+
+
+class Found(NamedTuple):
+    """Angles that the pose may have missed, rad."""
+
+    astray: Wheels4  # of the sides
+    wheels: list[tuple[SideName, Wheels4]]  # of a side whose wheels contradict each other
+    explained: bool  # a delay explains all that the sides were in doubt of
+
+
+class Doubts(Struct):
+    left: Trail = field(default_factory=Trail)
+    right: Trail = field(default_factory=Trail)
+    # Since the last update.
+    commanded: tuple[Rad, Rad] = (0.0, 0.0)  # of the left and the right side
+    rolled: Wheels4 = AT_REST
+    repaired: Wheels4 = AT_REST
+    seconds: Seconds = 0.0
+    unknown: bool = False  # the emergency stop may have cut the power
+
+    @property
+    def differs(self) -> bool:
+        """Whether the difference is larger than the doubt."""
+        return self.left.differs or self.right.differs
+
+    def add(self, wheels: Wheels, rolled: Wheels4, seconds: Seconds) -> None:
+        """Add a line, in which the wheels rolled by these angles."""
+        commanded = wheels.commanded
+        if commanded is None:
+            self.unknown = True
+        else:
+            left, right = self.commanded
+            left += commanded.front_left * seconds
+            self.commanded = left, right + commanded.front_right * seconds
+        self.rolled = plus(self.rolled, rolled)
+        if wheels.excludes:
+            self.repaired = plus(self.repaired, wheels.repair)
+        self.seconds += seconds
+        if wheels.fault is not None:
+            self.left.differs = self.right.differs = True
+
+    def update(self, wheels: Wheels, lag: Seconds, count: Rad) -> Found:
+        """End the open lines, and return what is in doubt now."""
+        s, rolled = self.seconds, self.rolled
+        used = plus(wheels.believed(rolled), self.repaired)
+        astray, wheels_astray, explained = AT_REST, list[tuple[SideName, Wheels4]](), s > 0.0
+        trails = (self.left, self.right)
+        for trail, side, commanded in zip(trails, wheels.sides, self.commanded, strict=True):
+            if s <= 0.0:
+                break
+            angle = (used[side.front] + used[3 - side.front]) / 2
+            rests = all(wheels.wheels[i].rested for i in side.wheels)
+            if rests:
+                trail.rest(lag, count)
+            elif self.unknown:
+                trail.restart(angle / s)
+            else:
+                trail.follow(commanded / s, angle, s, lag)
+            explained = explained and rests and not trail.largest
+            if side.out >= 0 or side.slip_s > 0.0:
+                half = (rolled[side.front] - rolled[side.rear]) / 2
+                wheels_astray.append((side.name, of_side(side.front, half)))
+        # One side alone would be in doubt of a turn.
+        if self.left.ends(count) or self.right.ends(count):
+            left, right = self.left.take(lag, count), self.right.take(lag, count)
+            astray = right, left, left, right
+        self.commanded, self.seconds, self.unknown = (0.0, 0.0), 0.0, False
+        self.rolled = self.repaired = AT_REST
+        return Found(astray, wheels_astray, explained)
+
+    def forget(self) -> None:
+        """Forget all doubts: the pose was set."""
+        self.left.forget()
+        self.right.forget()
+
+
+def of_side(front: int, angle: Rad) -> Wheels4:
+    return (angle, 0.0, 0.0, angle) if front == 0 else (0.0, angle, angle, 0.0)

@@ -1,0 +1,105 @@
+"""What a side shows otherwise than commanded is in doubt until a delay of the motor explains it."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+
+from acsard.core.motion.doubts import Trail
+from tests.each import each
+
+STEP_S, LAG_S, FINE, COARSE = 0.05, 0.2, math.tau / 3200, math.tau / 16
+
+
+class Bench:
+    """A side that is commanded, and what its encoders show."""
+
+    def __init__(self, count: float = FINE) -> None:
+        self.trail, self.count, self.doubt, self.off = Trail(), count, 0.0, 0.0
+        self.speed = 0.0
+        self.angle = 0.0
+
+    def run(
+        self,
+        command: float,
+        seconds: float,
+        gain: float = 1.0,
+        motor: float = 0.15,
+        dead: bool = False,
+    ) -> None:
+        """Let a motor with this lag follow the command; the encoders show `gain` of it."""
+        for _ in range(round(seconds / STEP_S)):
+            self.speed = command + (self.speed - command) * math.exp(-STEP_S / motor)
+            before, self.angle = self.angle, self.angle + self.speed * STEP_S
+            turned = self.angle - before
+            shown = gain * turned
+            self.off += turned - shown
+            self.trail.follow(command, shown, STEP_S, LAG_S)
+            if self.trail.ends(self.count):
+                self.doubt += self.trail.take(LAG_S, self.count)
+
+    def rest(self) -> bool:
+        self.trail.rest(LAG_S, self.count)
+        if not self.trail.largest:
+            self.doubt = 0.0
+        return not self.trail.largest
+
+
+@each("motor", [0.02, 0.1, 0.3])
+@each("count", [FINE, COARSE])
+def test_a_side_that_obeys_is_not_in_doubt_when_it_rests(motor: float, count: float) -> None:
+    bench = Bench(count)
+    for _ in range(20):
+        for speed in (10.0, -6.0, 0.0):
+            bench.run(speed, 2.0, motor=motor)
+        bench.rest()
+        assert bench.doubt == 0.0
+    assert not bench.trail.differs
+
+
+@each("count", [FINE, COARSE])
+@each("gain", [-1.0, 0.5, 1.5, 2.0])
+def test_the_whole_difference_is_in_doubt_at_once(gain: float, count: float) -> None:
+    bench = Bench(count)
+    bench.run(10.0, 3.0)
+    for _ in range(90):
+        before = bench.off
+        bench.run(10.0, 0.05, gain=gain)
+        assert abs(bench.doubt) > 0.6 * abs(bench.off) - 3.0 * count - abs(bench.off - before)
+    assert bench.trail.differs
+
+
+def test_a_difference_that_was_larger_than_a_delay_stays_although_it_is_paid_back() -> None:
+    bench = Bench()
+    bench.run(10.0, 3.0, gain=0.0)
+    bench.run(-10.0, 3.0, gain=0.0)
+    bench.run(0.0, 2.0)
+    assert not bench.rest()
+    assert bench.trail.differs
+
+
+@each("gain", [0.8, 0.85, 1.2])
+def test_a_weak_difference_is_said_within_its_doubt(gain: float) -> None:
+    bench = Bench()
+    while not bench.trail.differs:
+        bench.run(10.0, 0.1, gain=gain)
+        assert abs(bench.off) < 1.5 * abs(bench.doubt) + 2.0
+        assert bench.angle < 200.0
+
+
+@each("gain", [0.96, 1.03])
+def test_a_side_that_nearly_obeys_is_not_said(gain: float) -> None:
+    bench = Bench()
+    bench.run(10.0, 600.0, gain=gain)
+    assert not bench.trail.differs
+    # The doubt is bounded.
+    assert abs(bench.doubt) == pytest.approx(28.0, rel=0.3)
+
+
+def test_a_pose_that_is_set_has_no_doubt() -> None:
+    bench = Bench()
+    bench.run(10.0, 3.0, gain=0.0)
+    bench.trail.forget()
+    assert not bench.trail.differs
+    assert bench.trail.astray == 0.0
