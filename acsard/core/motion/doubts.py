@@ -37,7 +37,7 @@ class Trail(Struct):
     """What one side shows otherwise than commanded, rad."""
 
     expected: RadPerS = 0.0  # command behind half of the response time: a motor may be quicker
-    fastest: RadPerS = 0.0  # since the last rest
+    fastest: RadPerS = 0.0  # expected in about `MEMORY_S`
     due: Rad = 0.0  # in the open step
     shown: Rad = 0.0
     seconds: Seconds = 0.0
@@ -71,7 +71,7 @@ class Trail(Struct):
         """End the step, and return what is in doubt now, as one standard deviation."""
         more, disagrees, size = self.due - self.shown, self.disagrees(count), abs(self.due)
         keep = 1.0 / (1.0 + self.seconds / MEMORY_S) if size or self.shown else 1.0
-        self.recent = keep * self.recent + size
+        self.recent, self.fastest = keep * self.recent + size, keep * self.fastest
         self.short = keep * self.short + more
         self.due = self.shown = self.seconds = 0.0
         most = SHARE * self.recent + (DELAY_S + lag) * self.fastest + COUNTS * count
@@ -87,7 +87,7 @@ class Trail(Struct):
     def rest(self, lag: Seconds, count: Rad) -> None:
         """Note that the side rests: a delay may explain all of the doubt."""
         self.expected = self.due = self.shown = self.seconds = 0.0
-        fastest, self.fastest = self.fastest, 0.0
+        fastest = self.fastest
         left = max(abs(self.astray + self.weak), abs(self.short)) - COUNTS * count
         taken = self.largest - COUNTS * count
         if left <= LEFT_S * fastest and taken <= (TAKEN_S + lag) * fastest and not self.differs:
