@@ -105,9 +105,8 @@ class Odometry(Struct):
         if line.turned is not None and not line.count:
             seen = times(reported, seconds)  # the counts seem wrong, which is no fault of a wheel
         elif gap and gap.filled and line.turned is None:
-            # Nobody knows how the wheels turned behind a lost line, and a speed of a coarse encoder
-            # is no mean: take them to go on as before.
-            seen = times(wheels.smoothed, seconds)
+            # The next line confirms a speed behind a silence.
+            seen = times(self.speeds.as_tuple(), seconds)
         known = gap is None or not gap.unknown
         checks.check_line(model, line, rolled, seen, whole, known=known)
         turn, slips = checks.turn, checks.slips

@@ -180,13 +180,6 @@ class Wheels(Struct):
         return _wheels4(values)
 
     @property
-    def smoothed(self) -> Wheels4:
-        """The smoothed speeds, rad/s."""
-        front_right, front_left, *rear = [wheel.speed for wheel in self.wheels]
-        rear_left, rear_right = rear or (front_left, front_right)
-        return front_right, front_left, rear_left, rear_right
-
-    @property
     def names(self) -> tuple[str, ...]:
         return wheel_names(len(self.wheels))
 
