@@ -231,7 +231,7 @@ class Problem:
         names = [piece.run.name if not piece.run.tape else "" for piece in self.pieces]
         if len(set(names) - {""}) < MIN_RUNS:
             names = [name and str(n) for n, name in enumerate(names)]
-        groups = np.array(sorted(set(names) - {""}))[:, None] == np.array(names)
+        groups = [np.array(names) == name for name in sorted(set(names) - {""})]
         left_out = np.array([found.without(group)[self.free] for group in groups])
         apart, n = left_out - left_out.sum(axis=0) / max(1, len(groups)), max(1, len(groups))
         jackknife = apart.T @ apart * (n - 1) / n

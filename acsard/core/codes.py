@@ -370,8 +370,9 @@ counts_and_speeds_differ
 wheels_and_commands_differ
     the wheels report another motion than was commanded, so the motors are blocked, too weak or too
     strong, or the board reports wrong speeds; the pose follows the wheels:
-    -> measure a straight drive with a tape; if the pose is wrong, correct wheel_radius or the
-    speeds in the firmware, else the speed control of the motors; set_pose ends this doubt
+    -> repair the wheel that a fault has named. Else measure a straight drive with a tape: if the
+    pose is wrong, correct the encoders or the speeds in the firmware, else the speed control of
+    the motors. Then type `acsard call set_pose`, which ends this warning
 encoder_counts_missing
     the speeds jump as those of coarse encoders do, and mcu.encoder_counts is not set, so the
     heading drifts, and damaged lines are not noticed:

@@ -219,3 +219,13 @@ def test_of_two_wheels_none_is_left_out_and_a_dead_encoder_is_reported_once(whee
     reports = [event.text for event in made.events if event.name == "wheel_fault"]
     assert len(reports) == 1
     assert made.state.mode == "driving"
+
+
+def test_the_motion_that_the_pose_gets_back_leaves_no_side_in_doubt() -> None:
+    """The lines before the one that showed the fault count once."""
+    made = world(counts=400, sim=SimConfig(encoder_counts=400))
+    made.drive(0.5, seconds=2.0)
+    with made.mcu.fault("reversed_encoder", 1):
+        made.hold(0.5, 0.0, seconds=1.0)
+    left = made.loop.robot.state.odometry.doubts.left
+    assert abs(left.astray + left.weak) < 0.1

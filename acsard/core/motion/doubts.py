@@ -9,14 +9,13 @@ contradict each other are in doubt by half of their difference.
 
 from __future__ import annotations
 
-import math
 from typing import NamedTuple
 
 from msgspec import Struct, field
 
 from acsard.core.motion.gaps import AT_REST, plus
 from acsard.core.motion.obedience import AGREEMENT
-from acsard.core.motion.sides import SideName
+from acsard.core.motion.sides import SideName, lagged
 from acsard.core.motion.wheels import Wheels
 from acsard.core.values import Rad, RadPerS, Seconds, Wheels4
 
@@ -50,11 +49,9 @@ class Trail(Struct):
 
     def follow(self, command: RadPerS, angle: Rad, s: Seconds, lag: Seconds) -> None:
         """Add a motion to the open step."""
-        lag, keep = lag / 2, math.exp(-2 * s / lag)
-        behind = self.expected - command
-        self.expected = command + behind * keep
+        self.expected, due = lagged(self.expected, command, s, lag / 2)
         self.fastest = max(self.fastest, abs(self.expected))
-        self.due += command * s + behind * lag * (1.0 - keep)
+        self.due += due
         self.shown += angle
         self.seconds += s
 
@@ -116,7 +113,7 @@ class Doubts(Struct):
     # Since the last update.
     commanded: tuple[Rad, Rad] = (0.0, 0.0)  # of the left and the right side
     rolled: Wheels4 = AT_REST
-    repaired: Wheels4 = AT_REST
+    used: Wheels4 = AT_REST  # by the pose
     seconds: Seconds = 0.0
     unknown: bool = False  # the emergency stop may have cut the power
 
@@ -134,17 +131,16 @@ class Doubts(Struct):
             left, right = self.commanded
             left += commanded.front_left * seconds
             self.commanded = left, right + commanded.front_right * seconds
-        self.rolled = plus(self.rolled, rolled)
+        self.rolled, self.used = plus(self.rolled, rolled), plus(self.used, wheels.believed(rolled))
         if wheels.excludes:
-            self.repaired = plus(self.repaired, wheels.repair)
+            self.used = plus(self.used, wheels.repair)
         self.seconds += seconds
         if wheels.fault is not None:
             self.left.differs = self.right.differs = True
 
     def update(self, wheels: Wheels, lag: Seconds, count: Rad) -> Found:
         """End the open lines, and return what is in doubt now."""
-        s, rolled = self.seconds, self.rolled
-        used = plus(wheels.believed(rolled), self.repaired)
+        s, rolled, used = self.seconds, self.rolled, self.used
         astray, wheels_astray, explained = AT_REST, list[tuple[SideName, Wheels4]](), s > 0.0
         trails = (self.left, self.right)
         for trail, side, commanded in zip(trails, wheels.sides, self.commanded, strict=True):
@@ -167,7 +163,7 @@ class Doubts(Struct):
             left, right = self.left.take(lag, count), self.right.take(lag, count)
             astray = right, left, left, right
         self.commanded, self.seconds, self.unknown = (0.0, 0.0), 0.0, False
-        self.rolled = self.repaired = AT_REST
+        self.rolled = self.used = AT_REST
         return Found(astray, wheels_astray, explained)
 
     def forget(self) -> None:

@@ -87,11 +87,6 @@ class Obedience(Struct):
         """How far the wheel rolled on, too far or the wrong way, whatever its delay is."""
         return min(self.astray)
 
-    @property
-    def off(self) -> Rad:
-        """The same, or how far it did not roll."""
-        return max(self.unexplained, min(self.slow))
-
     def add(
         self, speed: RadPerS, shown: RadPerS, bounds: list[Bounds], s: Seconds, limit: Rad
     ) -> None:

@@ -91,9 +91,9 @@ class Side(Struct):
         goal, self.command = (self.command + command) / 2, command
         self.told = command, command
         self.angle += goal * s
-        self.expected, angle = _lagged(self.expected, goal, s, lag)
+        self.expected, angle = lagged(self.expected, goal, s, lag)
         self.whole_angle += angle
-        self.halfway, angle = _lagged(self.halfway, goal, s, lag / 2)
+        self.halfway, angle = lagged(self.halfway, goal, s, lag / 2)
         self.half_angle += angle
 
     def remember(self, s: Seconds, share: float, *before: RadPerS) -> None:
@@ -236,7 +236,7 @@ class Side(Struct):
         return ("still" if min(abs(one), abs(other)) <= 0.1 * larger else ""), -1
 
 
-def _lagged(speed: RadPerS, goal: RadPerS, s: Seconds, lag: Seconds) -> tuple[RadPerS, Rad]:
-    # The speed behind a lag at the end of a block, and the angle in it.
+def lagged(speed: RadPerS, goal: RadPerS, s: Seconds, lag: Seconds) -> tuple[RadPerS, Rad]:
+    """Return the speed behind a lag at the end of `s` seconds, and the angle in them."""
     before, rest = speed - goal, math.exp(-s / lag)
     return goal + before * rest, goal * s + before * lag * (1.0 - rest)
