@@ -228,4 +228,4 @@ def test_the_motion_that_the_pose_gets_back_leaves_no_side_in_doubt() -> None:
     with made.mcu.fault("reversed_encoder", 1):
         made.hold(0.5, 0.0, seconds=1.0)
     left = made.loop.robot.state.odometry.doubts.left
-    assert abs(left.astray + left.weak) < 0.1
+    assert abs(left.short) < 0.1

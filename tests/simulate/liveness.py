@@ -64,11 +64,12 @@ UNSHARED = (*ECHOING, "plain", "bridge")
 
 QUIET_FAULTS = {
     "mute", "pushed", "slow_reply", "ftdi", "stalls", "sparse_replies", "lost_replies",
-    "stuck_encoder", "frozen_encoder", "dead_motor", "reversed_motor", "reversed_encoder", "bias",
+    "stuck_encoder", "frozen_encoder", "reversed_motor", "reversed_encoder", "bias",
     "swapped_motors", "swapped_encoders", "late_watchdog", "no_watchdog",
 }  # fmt: skip
 """Faults of the board that ask no sender for a zero, unless the board is silent for 1 s or a fault
-is latched. Others damage lines, so that they may look like a silent board or a reset."""
+is latched. Others damage lines, so that they may look like a silent board or a reset, or no wheel
+begins to move, which asks for one after 3 s."""
 
 TROUBLE_NS = 2 * NS
 """After another fault of the board, and after a reset, the daemon knows within this time that the

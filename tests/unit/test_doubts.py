@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import math
 
-import pytest
-
 from acsard.core.motion.doubts import Trail
 from tests.each import each
 
@@ -58,15 +56,17 @@ def test_a_side_that_obeys_is_not_in_doubt_when_it_rests(motor: float, count: fl
     assert not bench.trail.differs
 
 
-@each("count", [FINE, COARSE])
-@each("gain", [-1.0, 0.5, 1.5, 2.0])
+@each(
+    ("gain", "count"),
+    [(-1.0, FINE), (0.5, FINE), (1.5, FINE), (2.0, FINE), (-1.0, COARSE), (2.0, COARSE)],
+)
 def test_the_whole_difference_is_in_doubt_at_once(gain: float, count: float) -> None:
     bench = Bench(count)
     bench.run(10.0, 3.0)
     for _ in range(90):
         before = bench.off
         bench.run(10.0, 0.05, gain=gain)
-        assert abs(bench.doubt) > 0.6 * abs(bench.off) - 3.0 * count - abs(bench.off - before)
+        assert abs(bench.doubt) > 0.6 * abs(bench.off) - 4.5 * count - abs(bench.off - before)
     assert bench.trail.differs
 
 
@@ -80,12 +80,15 @@ def test_a_difference_that_was_larger_than_a_delay_stays_although_it_is_paid_bac
 
 
 @each("gain", [0.8, 0.85, 1.2])
-def test_a_weak_difference_is_said_within_its_doubt(gain: float) -> None:
+def test_a_weak_difference_is_said_while_it_lasts(gain: float) -> None:
+    """It may be a slope: then nothing is wrong, and nothing of it stays."""
     bench = Bench()
-    while not bench.trail.differs:
+    while not bench.trail.weak:
         bench.run(10.0, 0.1, gain=gain)
-        assert abs(bench.off) < 1.5 * abs(bench.doubt) + 2.0
         assert bench.angle < 200.0
+    bench.run(10.0, 60.0)
+    assert not bench.trail.weak
+    assert not bench.trail.differs
 
 
 @each("gain", [0.96, 1.03])
@@ -93,8 +96,8 @@ def test_a_side_that_nearly_obeys_is_not_said(gain: float) -> None:
     bench = Bench()
     bench.run(10.0, 600.0, gain=gain)
     assert not bench.trail.differs
-    # The doubt is bounded.
-    assert abs(bench.doubt) == pytest.approx(28.0, rel=0.3)
+    assert not bench.trail.weak
+    assert abs(bench.doubt) < 3.0
 
 
 def test_a_pose_that_is_set_has_no_doubt() -> None:

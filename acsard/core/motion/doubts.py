@@ -3,8 +3,8 @@
 Nothing tells a motor that does not obey from an encoder that lies. So the difference of a side and
 its command is in doubt at once, whatever the verdict on its wheels will be. A delay of the motor
 gives it back by the next rest, and only that takes the doubt away. What `AGREEMENT` allows may be a
-weak motor: this doubt is bounded, and beyond the bound `state` says it. Two wheels of a side that
-contradict each other are in doubt by half of their difference.
+slope or a weak motor: this is no doubt, but `state` says it while it lasts for long. Two wheels of
+a side that contradict each other are in doubt by half of their difference.
 """
 
 from __future__ import annotations
@@ -43,8 +43,9 @@ class Trail(Struct):
     recent: Rad = 0.0  # due in either direction, in `MEMORY_S`
     short: Rad = 0.0  # due minus shown, in `MEMORY_S`
     astray: Rad = 0.0  # due minus shown, beyond `AGREEMENT`
-    weak: Rad = 0.0  # due minus shown, within it, and bounded
-    largest: Rad = 0.0  # of both, since they were 0
+    largest: Rad = 0.0  # of it, since it was 0
+    total: Rad = 0.0  # due minus shown since then
+    weak: bool = False  # within it, for long: said while it lasts
     differs: bool = False  # more than any delay explains: said until the pose is set
 
     def follow(self, command: RadPerS, angle: Rad, s: Seconds, lag: Seconds) -> None:
@@ -72,31 +73,34 @@ class Trail(Struct):
         self.short = keep * self.short + more
         self.due = self.shown = self.seconds = 0.0
         most = SHARE * self.recent + (DELAY_S + lag) * self.fastest + COUNTS * count
-        self.differs |= abs(self.short) > most
-        if disagrees:
-            self.astray += more
-        else:
-            before, self.weak = self.weak, max(-most, min(self.weak + more, most))
-            more = self.weak - before
-        self.largest = max(self.largest, abs(self.astray + self.weak))
+        self.weak = abs(self.short) > (most / 2 if self.weak else most)
+        if self.largest:
+            self.total += more
+        if not disagrees:
+            return 0.0
+        if not self.largest:
+            self.total = more
+        self.astray += more
+        self.largest = max(self.largest, abs(self.astray))
+        self.differs |= abs(self.astray) > most
         return more
 
     def rest(self, lag: Seconds, count: Rad) -> None:
         """Note that the side rests: a delay may explain all of the doubt."""
         self.expected = self.due = self.shown = self.seconds = 0.0
         fastest = self.fastest
-        left = max(abs(self.astray + self.weak), abs(self.short)) - COUNTS * count
+        left = min(abs(self.astray), abs(self.total)) - COUNTS * count
         taken = self.largest - COUNTS * count
         if left <= LEFT_S * fastest and taken <= (TAKEN_S + lag) * fastest and not self.differs:
-            self.astray = self.weak = self.largest = 0.0
+            self.astray = self.largest = self.total = 0.0
 
     def restart(self, speed: RadPerS) -> None:
         """Note that nobody knows what is expected of a side with this speed."""
         self.expected, self.due, self.shown, self.seconds = speed, 0.0, 0.0, 0.0
 
     def forget(self) -> None:
-        self.astray = self.weak = self.largest = self.short = self.recent = 0.0
-        self.differs = False
+        self.astray = self.largest = self.total = self.short = self.recent = 0.0
+        self.weak = self.differs = False
 
 
 class Found(NamedTuple):
@@ -120,12 +124,12 @@ class Doubts(Struct):
     @property
     def differs(self) -> bool:
         """Whether the difference is larger than the doubt."""
-        return self.left.differs or self.right.differs
+        return any(trail.differs or trail.weak for trail in (self.left, self.right))
 
     def add(self, wheels: Wheels, rolled: Wheels4, seconds: Seconds) -> None:
         """Add a line, in which the wheels rolled by these angles."""
         commanded = wheels.commanded
-        if commanded is None:
+        if commanded is None or wheels.unseen:
             self.unknown = True
         else:
             left, right = self.commanded

@@ -123,7 +123,7 @@ class Odometry(Struct):
             distance, angle = moved(plus(wheels.believed(rolled), wheels.repair))
         else:
             distance, angle = moved(rolled)
-        self.doubts.add(wheels, rolled, seconds)
+        self.doubts.add(wheels, rolled, whole)
         variance = 0.0
         if turn is not None:
             angle, angular, variance = turn.angle, turn.rate, turn.variance

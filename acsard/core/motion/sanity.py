@@ -93,7 +93,9 @@ class Sanity(Struct):
         possible, before, step = self.possible, self.before, line.step
         if line.counted is not None:
             step = line.count / MIN_COUNT_S  # the board has an own time for its counts
-        if not why and possible is not None and before is not None and line.turned is None:
+        # A line of a burst may have no time of its own: it moves nothing, and its step is unknown.
+        timed = line.turned is None and dt > 0.0
+        if not why and possible is not None and before is not None and timed:
             sudden = max(map(abs, map(sub, speeds, possible.speeds))) > SPEED_MARGIN
             if sudden and (self.trusted or _jump(now, before, step, names)):
                 why = _jump(now, possible, step, names)

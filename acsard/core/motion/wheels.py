@@ -234,6 +234,8 @@ class Wheels(Struct):
             if self.begins or self.unseen:
                 self._follow_commands(commanded, s, lag)
                 self._begin_at(part)
+                if any(angles):
+                    self._check_standstill(block)
                 parts = 0
             for _ in range(parts):
                 self._follow_commands(commanded, part.s, lag)
