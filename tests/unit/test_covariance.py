@@ -126,6 +126,7 @@ def metre(robot: Odometer) -> Matrix:
     return matrix(robot.fold(line(0.0, 0.05)).covariance) - before
 
 
+@pytest.mark.slow
 def test_a_long_way_makes_no_later_motion_less_certain() -> None:
     # Rounding adds nothing after 45 km and 100 000 rad, in 12 h at rest, and far from the origin.
     near, far = Odometer(), Odometer()
