@@ -21,6 +21,8 @@ ROOM = 10.0
 """Factor allowed beside the bound. It covers terms of second order and the shape of a path."""
 
 COUNTS_M2, COUNTS_RAD2 = 2e-3, 1e-3
+# Wheels that do not obey at once are in doubt of what they were commanded, 0.3 m and 0.3 rad.
+DOUBT_M2, DOUBT_RAD2 = 0.09, 0.09
 """Allowed beside the bound, for the place of a wheel within an encoder count of 1/96 turn, and for
 lines that come late, whose time is doubted."""
 
@@ -110,7 +112,7 @@ class Spread:
         self._yaw = math.sqrt(yaw**2 + self._yaw_by_metre * rolled + self._yaw_by_radian * turn)
         keep = math.exp((last[0] - estimate[0]) / (DELAY_S * NS))
         self._late, self._turned = keep * self._late + way, keep * self._turned + turn
-        late, turned = self._late**2 + COUNTS_M2, self._turned**2 + COUNTS_RAD2
+        late, turned = self._late**2 + DOUBT_M2, self._turned**2 + DOUBT_RAD2
         wide = self._yaw < UNKNOWN_RAD and xx + yy > ROOM * self._place**2 + late
         if wide or yawyaw > ROOM * self._yaw**2 + turned:
             raise BrokenError(
