@@ -20,7 +20,6 @@ SIZE, RATIO, TRACKS = 0.02, 0.01, {4: 0.3, 2: 0.05}
 ROOM = 10.0
 """Factor allowed beside the bound. It covers terms of second order and the shape of a path."""
 
-COUNTS_M2, COUNTS_RAD2 = 2e-3, 1e-3
 # Wheels that do not obey at once are in doubt of what they were commanded, 0.3 m and 0.3 rad.
 DOUBT_M2, DOUBT_RAD2 = 0.09, 0.09
 """Allowed beside the bound, for the place of a wheel within an encoder count of 1/96 turn, and for
