@@ -125,8 +125,8 @@ def run(
                 raise StoppedError(outcomes.find("wheels: not lifted"))
             watched = _Watched(operator, board, asleep_ns)
             board.abort_check = watched.check_operator
-            steps_ = _Steps(board, watched, once, all_restarts, config.drive.wheel_radius)
-            steps_.all(config.safety)
+            radius = config.drive.wheel_radius
+            _Steps(board, watched, once, all_restarts, radius).all(config.safety)
     except StoppedError as end:
         once(end.finding)
         why = f"the check ended early: {end.finding.name}"

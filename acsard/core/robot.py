@@ -437,7 +437,7 @@ class Robot:
         # Without a link the board hears nothing, and must stop the motors.
         speeds = state.out.speeds if state.session.link == "up" else STILL
         wheels.commanded = None if pressed else speeds
-        # Of the time of a silence nobody knows what the board was told.
+        # Nobody knows which commands the board got in a silence, or while this computer was late.
         passed = line.dt + line.gap
         silent = passed > self.link_setup.covered_s
         late = silent or state.session.steps.step_s > WRITE_PAUSE_S

@@ -20,10 +20,9 @@ SIZE, RATIO, TRACKS = 0.02, 0.01, {4: 0.3, 2: 0.05}
 ROOM = 10.0
 """Factor allowed beside the bound. It covers terms of second order and the shape of a path."""
 
-# Wheels that do not obey at once are in doubt of what they were commanded, 0.3 m and 0.3 rad.
 DOUBT_M2, DOUBT_RAD2 = 0.09, 0.09
-"""Allowed beside the bound, for the place of a wheel within an encoder count of 1/96 turn, and for
-lines that come late, whose time is doubted."""
+"""Allowed beside the bound, 0.3 m and 0.3 rad: wheels that do not obey at once leave what was
+commanded in doubt. It also covers lines that come late, and the place of a wheel within a count."""
 
 DELAY_S = 2.0
 """What a motor may seem to be late by is in doubt: at most about the motion of this time."""

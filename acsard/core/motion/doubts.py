@@ -119,11 +119,11 @@ class Doubts(Struct):
     rolled: Wheels4 = AT_REST
     used: Wheels4 = AT_REST  # by the pose
     seconds: Seconds = 0.0
-    unknown: bool = False  # the emergency stop may have cut the power
+    unknown: bool = False  # a silence, or an emergency stop that may have cut the power
 
     @property
     def differs(self) -> bool:
-        """Whether the difference is larger than the doubt."""
+        """Whether `state` says that the wheels differ from the commands."""
         return any(trail.differs or trail.weak for trail in (self.left, self.right))
 
     def add(self, wheels: Wheels, rolled: Wheels4, seconds: Seconds) -> None:

@@ -106,7 +106,8 @@ class Side(Struct):
         half += (self.half_angle - half * s) * share
         whole += (self.whole_angle - whole * s) * share
         self.smooth = command, half, whole
-        self.due.add(command, half, whole, *before, *before and (0.0,))
+        stopped = (0.0,) if before else ()
+        self.due.add(command, half, whole, *before, *stopped)
         self.angle = self.half_angle = self.whole_angle = 0.0
 
     def begin(self, speed: RadPerS) -> None:

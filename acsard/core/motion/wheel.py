@@ -1,4 +1,4 @@
-"""What one wheel showed, beside what was due: speeds, evidence, rest and warning."""
+"""The state of one wheel: its speeds, the evidence about it, its rest and its warning."""
 
 from __future__ import annotations
 

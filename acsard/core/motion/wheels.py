@@ -19,6 +19,7 @@ from msgspec import Struct, field
 
 from acsard.core.codes import Code, Reason, joined, reason
 from acsard.core.config.settings import FeedbackConfig
+from acsard.core.link.feedback import MAX_FILLED_GAP_S
 from acsard.core.motion.gaps import times
 from acsard.core.motion.kinematics import Kinematics
 from acsard.core.motion.obedience import (
@@ -53,7 +54,6 @@ from acsard.core.values import (
 )
 
 BLOCK_S = 0.05
-FILLED_S = 1.0  # the longest silence whose ends are evidence of the motion in it
 # The longest time for which one line is evidence: the longest `mcu.reply_period`. A line may also
 # cover a stall. It is as many blocks as it has times of `BLOCK_S`, or its delays were too long.
 MAX_BLOCK_S = 0.25
@@ -250,14 +250,15 @@ class Wheels(Struct):
             side.expect(speed, s, lag)
 
     def _pass(self, step_s: Seconds, lag: Seconds, block: Block) -> None:
-        # Let time pass that no line tells of. The wheels did what was due or what was due before,
-        # or stopped. Of the speeds at both ends of a short silence, the slower one is evidence.
+        # Let the time of a silence pass. The wheels may have followed the commands of this time or
+        # those before it, or have stopped. If the silence is short, the slower one of the speeds
+        # before and behind it is evidence.
         assert self.commanded is not None
         s = self.unseen
         if self.step_s:
             s -= step_s - self.step_s
             self._obey(block.unit)
-        short, ends = s <= FILLED_S, zip(self.wheels, block.speeds, strict=False)
+        short, ends = s <= MAX_FILLED_GAP_S, zip(self.wheels, block.speeds, strict=False)
         speeds = [_nearer(wheel.speed, speed) if short else 0.0 for wheel, speed in ends]
         before = [(*side.told, *side.smooth) for side in self.sides]
         for _ in range(min(DELAYS + 1, int(s / step_s + 1e-6))):
