@@ -31,12 +31,25 @@ def faults(world: World) -> list[str]:
     return [cause.code for cause in world.state.causes if cause.code.startswith("wheel")]
 
 
+def lose(world: World, seconds: float, *, unplug: bool) -> None:
+    """Lose the lines of the board, or its port."""
+    if unplug:
+        mcu = world.mcu
+        world.port.unplug()
+        world.run(seconds)
+        world.port.plug(mcu)
+    else:
+        with world.mcu.fault("mute"):
+            world.run(seconds)
+
+
+@pytest.mark.parametrize("unplug", [False, True])
 @pytest.mark.parametrize("counts", [20, 400])
 @pytest.mark.parametrize("lines_s", [0.05, 0.1, 0.3])
 @pytest.mark.parametrize("silent_s", [0.13, 0.2, 0.5])
 @four_and_two
 def test_a_runaway_behind_silences_is_found_within_two_metres(
-    silent_s: float, lines_s: float, counts: int, wheels: WheelMap
+    silent_s: float, lines_s: float, counts: int, unplug: bool, wheels: WheelMap
 ) -> None:
     """Time passes without lines, too: what was due before a stop is not due for ever."""
     world = flickering(counts, wheels)
@@ -46,10 +59,26 @@ def test_a_runaway_behind_silences_is_found_within_two_metres(
     with mcu.fault("pushed", 0.5):
         world.call("stop")
         while not faults(world) and mcu.vehicle.pose.x - began < 2.0:
-            with mcu.fault("mute"):
-                world.run(silent_s)
+            lose(world, silent_s, unplug=unplug)
             world.run(lines_s)
     assert faults(world)[0] == "wheel_runaway"
+
+
+@pytest.mark.parametrize("unplug", [False, True])
+@four_and_two
+def test_time_passes_in_long_silences(unplug: bool, wheels: WheelMap) -> None:
+    """Nobody knows what the wheels do in them: only the lines between them are evidence."""
+    world = flickering(400, wheels)
+    world.drive(0.5, seconds=2.0)
+    seen_s = 0.0
+    with world.mcu.fault("pushed", 0.5):
+        world.call("stop")
+        while not faults(world) and seen_s < 2.0:
+            lose(world, 1.5, unplug=unplug)
+            world.run(0.1)
+            seen_s += 0.1
+    assert faults(world)[0] == "wheel_runaway"
+    assert seen_s < 0.7
 
 
 @pytest.mark.parametrize(
@@ -58,23 +87,30 @@ def test_a_runaway_behind_silences_is_found_within_two_metres(
 )
 @four_and_two
 def test_a_sound_robot_behind_silences_latches_no_fault(seed: int, wheels: WheelMap) -> None:
-    """Only the board is silent, or the computer stalls, or both."""
+    """The board is silent, the computer stalls, both, or the port is lost."""
     dice = random.Random(seed)
     checked, declared = dice.random() < 0.5, dice.random() < 0.6
     world = flickering(dice.choice(COUNTS), wheels, declared=declared, checked=checked)
     silent, lines = dice.uniform(0.05, 0.5), dice.uniform(0.05, 0.5)
-    mute, stall = dice.choice([(True, False), (False, True), (True, True)])
+    mute, stall, unplug = dice.choice(
+        [(True, False, False), (False, True, False), (True, True, False), (False, False, True)]
+    )
+    mcu = world.mcu
     world.drive(0.3, seconds=1.0)
     end_ns = world.now_ns + 20 * NS_PER_S
     while world.now_ns < end_ns:
         wish = dice.choice([(0.5, 0.0), (dice.uniform(-1, 1), dice.uniform(-2, 2))])
         for _ in range(dice.randrange(1, 6)):
             seconds = silent * dice.uniform(0.7, 1.3)
+            if unplug:
+                world.port.unplug()
             with world.mcu.fault("mute") if mute else nullcontext():
                 if stall:
                     world.stall(seconds)
                 else:
                     world.hold(*wish, seconds=seconds)
+            if unplug:
+                world.port.plug(mcu)
             world.send(*wish)
             world.hold(*wish, seconds=lines * dice.uniform(0.7, 1.3))
             assert not faults(world), world.state.reason

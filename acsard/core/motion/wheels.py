@@ -20,7 +20,7 @@ from msgspec import Struct, field
 from acsard.core.codes import Code, Reason, joined, reason
 from acsard.core.config.settings import FeedbackConfig
 from acsard.core.link.feedback import MAX_FILLED_GAP_S
-from acsard.core.motion.gaps import times
+from acsard.core.motion.gaps import plus, times
 from acsard.core.motion.kinematics import Kinematics
 from acsard.core.motion.obedience import (
     AGREEMENT,
@@ -87,8 +87,14 @@ class Wheels(Struct):
     commanded: WheelSpeeds | None = STILL
     # For which the last line does not tell what the wheels did: lines or commands are missing.
     unseen: Seconds = 0.0
+    # The silence before the block, and how far and for how long its last line says they turned.
+    silent_s: Seconds = 0.0
+    covered: Wheels4 = NOTHING
+    covered_s: Seconds = 0.0
     begins: bool = True  # the expected speeds begin at the measured ones
     angles: Wheels4 = NOTHING  # of the block, rad
+    line: Wheels4 = NOTHING  # of the last line, rad
+    speeds: WheelSpeeds = STILL  # in it
     turn: Rad = 0.0  # of the block by a gyro
     by_gyro: bool = True  # it is known
     seconds: Seconds = 0.0
@@ -122,8 +128,12 @@ class Wheels(Struct):
         self.events, self.fault, self.pushed, self.repair = (), None, "", NOTHING
         self.gives_up = False
         if self.unseen:
-            self.unseen += self.seconds
-            self._begin()
+            # The lines before a silence are a block, and so are those behind it.
+            self._end_block(feedback, kinematics, count)
+            self.silent_s, self.speeds = self.unseen, speeds
+            self.covered, self.covered_s = times(speeds.as_tuple(), dt), dt
+            return
+        self.line, self.speeds = turned, speeds
         front_right, front_left, rear_left, rear_right = self.angles
         first, second, third, fourth = turned
         front_right += first
@@ -138,22 +148,12 @@ class Wheels(Struct):
         else:
             self.turn += turn
         most = self.max_difference
-        if (
-            not self.unseen
-            and seconds < BLOCK_S
-            and (
-                self.lines == 1
-                or (
-                    -most < front_left - rear_left < most
-                    and -most < front_right - rear_right < most
-                )
-            )
+        if seconds < BLOCK_S and (
+            self.lines == 1
+            or (-most < front_left - rear_left < most and -most < front_right - rear_right < most)
         ):
             return
-        if feedback.encoders and seconds > 0.0:
-            self.max_difference = OUT_COUNTS * count + OUT_ANGLE
-            self._end_block(turned, speeds.as_tuple(), feedback.response_time, kinematics, count)
-        self._begin()
+        self._end_block(feedback, kinematics, count)
 
     def tell(self, commanded: WheelSpeeds) -> None:
         """Take a command that is written, with or without lines: the wheels may follow it."""
@@ -197,6 +197,7 @@ class Wheels(Struct):
 
     def _begin(self) -> None:
         self.angles, self.seconds, self.lines, self.turn, self.by_gyro = NOTHING, 0.0, 0, 0.0, True
+        self.silent_s = 0.0
 
     def _drop(self) -> None:
         self.begins = True
@@ -205,45 +206,48 @@ class Wheels(Struct):
             wheel.fast_s = wheel.fast_angle = 0.0
         self.standstill.forget()
 
-    def _end_block(
-        self, line: Wheels4, speeds: Wheels4, lag: Seconds, kinematics: Kinematics, count: Rad
-    ) -> None:
-        s, angles, commanded = self.seconds, self.angles, self.commanded
+    def _end_block(self, feedback: FeedbackConfig, kinematics: Kinematics, count: Rad) -> None:
+        if feedback.encoders and (self.seconds or self.silent_s):
+            self.max_difference = OUT_COUNTS * count + OUT_ANGLE
+            self._judge(feedback.response_time, kinematics, count)
+        self._begin()
+
+    def _judge(self, lag: Seconds, kinematics: Kinematics, count: Rad) -> None:
+        s, angles, line = self.seconds, self.angles, self.line
         if s > MAX_BLOCK_S:
             share, s = MAX_BLOCK_S / s, MAX_BLOCK_S
             angles, line = times(angles, share), times(line, share)
         rest = REST_S + 2 * count * kinematics.radius / LEAST_SPEED
-        block = Block(s, angles, line, speeds, count, rest)
+        block = Block(s, angles, line, self.speeds.as_tuple(), count, rest)
+        step_s = max(BLOCK_S, (max(DEAD_TIME_S, lag) - BLOCK_S / 2) / DELAYS)
+        commanded = self.commanded
+        if commanded is not None and self.silent_s:
+            self._pass(step_s, lag, block)
         if commanded is None:
             self._drop()
             self._follow_commands(STILL, s, lag)
-            self.step_s += s
-            if self.step_s >= BLOCK_S:
-                # What was due before the press is still due after it: it may be a short one.
+            self.step_s += s + self.silent_s
+            # What was due before the press is still due after it: it may be a short one.
+            if steps := _steps(self.step_s, step_s):
                 for side in self.sides:
-                    side.remember(self.step_s, 1.0 / self.step_s)
+                    for _ in range(steps):
+                        side.remember(step_s, 1.0 / step_s)
                 self._begin_step()
             for wheel, angle in zip(self.wheels, angles, strict=False):
                 wheel.rest(angle, block)
-        else:
+        elif s:
             parts = max(1, int(s / BLOCK_S + 1e-6))
             part = block._replace(s=s / parts, angles=times(angles, 1.0 / parts))
-            step_s = max(BLOCK_S, (max(DEAD_TIME_S, lag) - BLOCK_S / 2) / DELAYS)
-            if self.unseen:
-                self._pass(step_s, lag, block)
-            if self.begins or self.unseen:
-                self._follow_commands(commanded, s, lag)
+            if self.begins or self.silent_s:
                 self._begin_at(part)
-                if any(angles):
-                    self._check_standstill(block)
-                parts = 0
             for _ in range(parts):
                 self._follow_commands(commanded, part.s, lag)
                 self._add(part)
                 if self.step_s >= step_s - 1e-9:
                     self._obey(count)
                     self._begin_step()
-        self._compare(block, kinematics)
+        if s:
+            self._compare(block, kinematics)
 
     def _follow_commands(self, commanded: WheelSpeeds, s: Seconds, lag: Seconds) -> None:
         for side, speed in zip(self.sides, _of_sides(commanded), strict=True):
@@ -254,20 +258,27 @@ class Wheels(Struct):
         # those before it, or have stopped. If the silence is short, the slower one of the speeds
         # before and behind it is evidence.
         assert self.commanded is not None
-        s = self.unseen
+        s, ends = self.silent_s, block.speeds
+        shown_s = self.covered_s + block.s
+        if shown_s:
+            ends = times(plus(self.covered, block.angles), 1.0 / shown_s)
+        short = s <= MAX_FILLED_GAP_S
         if self.step_s:
             s -= step_s - self.step_s
             self._obey(block.unit)
-        short, ends = s <= MAX_FILLED_GAP_S, zip(self.wheels, block.speeds, strict=False)
-        speeds = [_nearer(wheel.speed, speed) if short else 0.0 for wheel, speed in ends]
+        pairs = zip(self.wheels, ends, strict=False)
+        speeds = [_nearer(wheel.speed, speed) if short else 0.0 for wheel, speed in pairs]
         before = [(*side.told, *side.smooth) for side in self.sides]
-        for _ in range(min(DELAYS + 1, int(s / step_s + 1e-6))):
+        unknown = [side for side in self.sides if not any(speeds[i] for i in side.wheels)]
+        for _ in range(_steps(s, step_s)):
             self._begin_step()
             self._follow_commands(self.commanded, step_s, lag)
             for wheel, speed in zip(self.wheels, speeds, strict=True):
                 wheel.turned = wheel.sure = speed * step_s
             self.step_s = step_s
-            self._obey(block.unit, before)
+            self._obey(block.unit, before, unknown)
+        for wheel in self.wheels:
+            wheel.play = 0.0 if wheel.speed > 0.0 else block.unit  # the next count may be of then
         self._begin_step()
 
     def _begin_at(self, block: Block) -> None:
@@ -293,7 +304,14 @@ class Wheels(Struct):
             wheel.add(block.angles[i], block.speeds[i], command, block, not still)
         self._check_standstill(block)
 
-    def _obey(self, count: Rad, before: Sequence[tuple[RadPerS, ...]] = ((), ())) -> None:
+    def _obey(
+        self,
+        count: Rad,
+        before: Sequence[tuple[RadPerS, ...]] = ((), ()),
+        unknown: Sequence[Side] = (),
+    ) -> None:
+        # End a step. If it is of a silence, the wheels may have had the speeds `before`. For the
+        # wheels of `unknown` sides only the time passes.
         s, fastest, least = self.step_s, 0.0, max(FAULT_ANGLE, FAULT_COUNTS * count)
         for side, speeds in zip(self.sides, before, strict=True):
             size = max(abs(side.angle) / s, *[abs(self.wheels[i].speed) for i in side.wheels])
@@ -301,6 +319,9 @@ class Wheels(Struct):
             if size * SMOOTHED_S > SMOOTHED_COUNTS * count:
                 smoothed = SMOOTHED_COUNTS * count / size
             share = 1.0 / (smoothed + s)
+            if side in unknown:
+                side.remember(s, 0.0, *speeds)
+                continue
             side.remember(s, share, *speeds)
             noise = NOISE_COUNTS * count * share
             bounds = side.due.bounds(noise)
@@ -447,6 +468,10 @@ def new_wheels(independent: int) -> Wheels:
 def count_angle(counts: int) -> Rad:
     """Return the angle of an encoder count; `counts` per turn are 0 if they are unknown."""
     return math.tau / (counts or ASSUMED_COUNTS)
+
+
+def _steps(s: Seconds, step_s: Seconds) -> int:
+    return min(DELAYS + 1, int(s / step_s + 1e-6))
 
 
 def _of_sides(speeds: WheelSpeeds) -> tuple[RadPerS, RadPerS]:
