@@ -150,7 +150,7 @@ class Wheels(Struct):
             )
         ):
             return
-        if feedback.encoders and seconds > 0.0:
+        if feedback.encoders and (seconds > 0.0 or self.unseen):
             self.max_difference = OUT_COUNTS * count + OUT_ANGLE
             self._end_block(turned, speeds.as_tuple(), feedback.response_time, kinematics, count)
         self._begin()
@@ -243,7 +243,8 @@ class Wheels(Struct):
                 if self.step_s >= step_s - 1e-9:
                     self._obey(count)
                     self._begin_step()
-        self._compare(block, kinematics)
+        if s:
+            self._compare(block, kinematics)
 
     def _follow_commands(self, commanded: WheelSpeeds, s: Seconds, lag: Seconds) -> None:
         for side, speed in zip(self.sides, _of_sides(commanded), strict=True):
@@ -260,6 +261,9 @@ class Wheels(Struct):
             self._obey(block.unit)
         short, ends = s <= MAX_FILLED_GAP_S, zip(self.wheels, block.speeds, strict=False)
         speeds = [_nearer(wheel.speed, speed) if short else 0.0 for wheel, speed in ends]
+        if not short:
+            for wheel in self.wheels:
+                wheel.speed = wheel.sure_speed = 0.0  # it is smoothed over less
         before = [(*side.told, *side.smooth) for side in self.sides]
         for _ in range(min(DELAYS + 1, int(s / step_s + 1e-6))):
             self._begin_step()
@@ -271,8 +275,10 @@ class Wheels(Struct):
         self._begin_step()
 
     def _begin_at(self, block: Block) -> None:
+        # The first line behind a long silence has no time of its own.
+        speeds = times(block.angles, 1.0 / block.s) if block.s else block.speeds
         for side in self.sides:
-            speed = max(block.angles[side.front], block.angles[side.rear], key=abs) / block.s
+            speed = max(speeds[side.front], speeds[side.rear], key=abs)
             side.begin(speed if self.begins else _nearer(side.expected, speed))
         self.begins = False
         self._begin_step()
