@@ -35,8 +35,8 @@ ROUNDING_MS = 2  # each of the two times is in whole ms
 # Excess over the least delay, which then rises; the session restarts after a gap of 1 s.
 MAX_DELAY_MS = 1000.0
 
-# Of driving, in a window of `CountsCheck`, and of a wheel. A window without a difference is full when
-# it would have shown one of this share: the way there and back is the same by both.
+# Of driving, in a window of `CountsCheck`, and of a wheel. A window without a difference is full
+# when it would have shown one of this share: the way there and back is the same by both.
 WINDOW_S, WINDOW_ANGLE, WINDOW_SHARE = 5.0, 2 * math.tau, 0.2
 
 # By which the angles of a wheel may differ: a share, counts (one at each end), rad/s by rounding,
