@@ -61,6 +61,25 @@ def test_counts_that_contradict_the_speeds_are_a_doubt_and_a_warning_has_both_va
     assert sigmas(robot) < 2.0
 
 
+@pytest.mark.variations(4)
+@pytest.mark.parametrize("forward", [1.0, 3.0, 4.0, 6.0])
+@pytest.mark.parametrize("back", [3.0, 4.0])
+@pytest.mark.parametrize("wrong", [0.7, 0.5, 1.6])
+@four_and_two
+def test_wrong_counts_of_a_robot_that_goes_to_and_fro_are_not_forgotten(
+    wrong: float, back: float, forward: float, wheels: WheelMap
+) -> None:
+    """The way there and back is the same by counts and by speeds, which refutes nothing."""
+    robot = world(3200, "on", round(3200 * wrong), wheels)
+    robot.run(0.5)
+    robot.drive(0.6, 0.0, 6.0)
+    for _ in range(5):
+        robot.drive(-0.6, 0.0, back)
+        robot.drive(0.6, 0.0, forward)
+        assert robot.state.pose_doubt == "counts_and_speeds_differ"
+        assert robot.state.mode == "driving", robot.state.reason
+
+
 @pytest.mark.variations(6)
 @pytest.mark.parametrize("counts", [16, 96, 3200])
 @pytest.mark.parametrize("lag", [0.0, 0.05, 0.2])

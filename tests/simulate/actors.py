@@ -165,6 +165,9 @@ class Run:
         self._bus_ns = 0
         """Until then the bus delivers no command, because the whole process stood still. The
         commands that came meanwhile arrive together at this time."""
+        self._refused: list[tuple[int, int, str]] = []
+        """Clears without numbers that this step has refused: their true time, that by the robot's
+        clock, and the answer."""
         self._full_ns = self._blocked_ns = -NS
         """When the disk was last seen full, and the output was last seen blocked."""
         self._hangs_until_ns = 0
@@ -405,13 +408,13 @@ class Run:
         ticket = self._ticket
 
         chosen = None if numbers is None else tuple(numbers)
-        self.causes.call(ticket, Call(verb, chosen, true_ns))
+        self.causes.call(ticket, Call(verb, chosen, at_ns))
 
         def answered(reply: bytes) -> None:
             success, text = read_reply(reply, via, service.endswith("set_parameters"))
             self.causes.answered(ticket, success)
             if verb == "clear" and not success and numbers is None:
-                self._refused_clear(true_ns, text)
+                self._refused.append((true_ns, at_ns, text))
             self.counts[f"{verb} {'done' if success else 'refused'}"] += 1
             if asks_for_zeros(verb, event, success, text):
                 self.liveness.event()
@@ -439,11 +442,14 @@ class Run:
         self._calls[ticket] = event, true_ns, answered
         product.call_service(at_ns, service, ticket, payload, via, attachment)
 
-    def _refused_clear(self, asked_ns: int, text: str) -> None:
+    def _judge_refusals(self) -> None:
         """Check that a clear without numbers works as soon as all causes have been shown."""
         held = bool(kinds(self.plan)) or self.witness.mode not in ("fault", "stopped")
-        if not held and self.causes.is_shown(asked_ns):
-            raise BrokenError("a clear works two seconds behind the newest cause", asked_ns, text)
+        for true_ns, asked_ns, text in self._refused:
+            if not held and self.causes.is_shown(asked_ns):
+                promise = "a clear works two seconds behind the newest cause"
+                raise BrokenError(promise, true_ns, text)
+        self._refused.clear()
 
     # the board and the host
 
@@ -801,7 +807,8 @@ class Run:
             self._take_answers()
             self._late_answers(true_ns)
         present = {number: Cause(kind, key) for number, kind, key in snapshot.latched}
-        self.causes.step(snapshot.decided_ns + offset, present)
+        self.causes.step(true_ns, snapshot.decided_ns, present)
+        self._judge_refusals()
         if witness.pending:
             witness.pending = {}
         if self._calls and self.product.disk.full:

@@ -3,6 +3,8 @@
 `state` numbers the causes that hold the robot. The judge compares their numbers from step to step.
 A cause may go only by a call that names it, by a call without numbers that came late enough for its
 sender to know all of them, or because an equal cause with a new number takes its place.
+
+Times are of the robot's clock, which stands still while the robot sleeps: nothing is shown then.
 """
 
 from __future__ import annotations
@@ -80,12 +82,12 @@ class Causes:
             self._done.append(call)
 
     def is_shown(self, asked_ns: int) -> bool:
-        """Return whether a call without numbers must work, of all that concerns its sender."""
+        """Return whether a call without numbers, answered in the last step, had to work."""
         causes = [n for n, cause in self._present.items() if cause.kind != "inactive"]
         latest_ns = max((self._shown_ns.get(number, asked_ns) for number in causes), default=0)
         return bool(causes) and asked_ns - latest_ns > SHOWN_NS + MARGIN_NS
 
-    def step(self, at_ns: int, present: dict[int, Cause]) -> None:
+    def step(self, true_ns: int, at_ns: int, present: dict[int, Cause]) -> None:
         """Judge the causes of a step that began at `at_ns`."""
         self._shown_ns |= dict.fromkeys(self._new, at_ns)
         self._new = []
@@ -97,7 +99,7 @@ class Causes:
             return
         fresh = present.keys() - before.keys()
         if begun and not fresh.isdisjoint(self._ever):
-            raise BrokenError("no number is used twice", at_ns, str(fresh & self._ever))
+            raise BrokenError("no number is used twice", true_ns, str(fresh & self._ever))
         self._ever |= present.keys()
         self._new = list(fresh)
         keys = {present[number] for number in fresh}
@@ -107,13 +109,13 @@ class Causes:
             joined = cause.key[0] == "stopped" and OTHERS in [present[n].key[0] for n in fresh]
             if not (renewed or joined or any(self._may(c, number, before) for c in calls)):
                 text = f"{cause} with number {number} is gone, and the calls were {calls}"
-                raise BrokenError("a call releases what it names, and no more", at_ns, text)
+                raise BrokenError("a call releases what it names, and no more", true_ns, text)
         for call in done:
             kinds = RELEASES[call.verb]
             for number in call.numbers or ():
                 if number in before and number in present and before[number].kind in kinds:
                     text = f"{call} was answered, and {before[number]} is still in force"
-                    raise BrokenError("a call releases what it names", at_ns, text)
+                    raise BrokenError("a call releases what it names", true_ns, text)
 
     def _may(self, call: Call, number: int, before: dict[int, Cause]) -> bool:
         """Return whether this call may release this one of the causes before it."""

@@ -25,6 +25,8 @@ def slow_wheels(plan: Plan, dice: random.Random, driver: Sender) -> None:
     counts = dice.choice((16, 64, 400, 3200))
     config["drive"] = config.get("drive", {}) | {"wheel_radius": radius}
     config["sim"]["encoder_counts"] = counts
+    if "encoder_counts" in config["mcu"]:
+        config["mcu"]["encoder_counts"] = counts
     config.get("feedback", {}).pop("wheel_speed", None)
     fastest = config["limits"]["linear_speed"] / radius
     config["limits"]["wheel_speed"] = round(min(40.0, max(3.0, 2.0 * fastest)), 2)

@@ -409,6 +409,9 @@ FAULTS = (
           "self.pose = Pose(pose.x, pose.y, math", "self.pose = Pose(pose.y, pose.x, math"),
     fault("odometry gap", "a gap while the robot moves does not make the pose less certain",
           ODOMETRY, "            if gap:\n", "            if gap and gap.seconds > 1e9:\n"),
+    fault("odometry lone", "a false speed behind a silence takes the doubt of another gap away",
+          ODOMETRY, "uncertainty.doubt(distance**2, turns * angle**2, 0.0, heading)",
+          'uncertainty.miss("gap", -distance, -turns * angle, heading)'),
     fault("odometry vague", "the covariance of the pose is a hundred times as large as the errors",
         UNCERTAINTY, "        self.covariance = p if known else UNKNOWN_POSE\n",
         "        p = PoseCovariance(*(100.0 * getattr(p, name) for name in p.__struct_fields__))\n"

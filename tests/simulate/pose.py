@@ -10,6 +10,7 @@ from typing import Any
 from tests.simulate.gyro_faults import GYRO_BIAS, GyroFaults
 from tests.simulate.promises import BrokenError
 from tests.simulate.roads import NS
+from tests.simulate.spread import RATIO, TRACKS
 from tests.simulate.wiring import wheels
 
 LIARS = {
@@ -107,10 +108,11 @@ class PoseWitness:
         self._unsure_m: float = turn * drive.get("wheel_radius", 0.05)
         """Distance that such encoders may be off, m."""
         rate = config.get("control", {}).get("rate", 100.0)
-        # The judge is weaker for two wheels in two places, both after a damaged speed, which no
-        # second wheel of its side halves or contradicts: here, and in the heading of a gap.
-        self._alone = len(wheels(config)) == 2
-        of_side = 1 if self._alone else 2
+        # No second wheel of its side halves or contradicts a damaged speed of two wheels.
+        independent = len(wheels(config))
+        of_side = independent // 2
+        self._track_share: float = TRACKS[independent] / multiplier + RATIO / 2
+        """Deviation of a turn, as a share of it, of a robot that nobody has calibrated."""
         self._per_flip_m = self.fastest / of_side / (100.0 if rate == "auto" else rate)
         """Distance by which one damaged speed of one line may move the pose, m."""
         self._known_ns = 0
@@ -387,11 +389,9 @@ class PoseWitness:
         if not stood or self._drifts:
             return
         turned = abs(math.remainder(eyaw - pose[2], math.tau))
-        if self._alone and yaw_variance > VAGUE:
-            # A damaged speed behind an earlier gap has turned the pose, and one the other way turns
-            # it back, which makes the covariance smaller.
-            yaw_variance = 0.0
-        sigma = math.sqrt(max(0.0, yawyaw - yaw_variance))
+        # A turn back takes away what the track may have falsified of the turns before it.
+        old_sigma = max(0.0, math.sqrt(yaw_variance) - self._track_share * turned)
+        sigma = math.sqrt(max(0.0, yawyaw - old_sigma**2))
         if turned > SIGMAS * sigma + ROOM_RAD:
             text = f"{turned:.3f} rad in {(sampled_ns + offset_ns - then_ns) / NS:.3f} s"
             raise BrokenError(

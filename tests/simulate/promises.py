@@ -59,6 +59,9 @@ SILENT_NS = 10 * NS + MARGIN_NS
 WAITED_NS = NS // 10 - MARGIN_NS
 """Behind a stall, speeds without a stamp are refused for this time: they may have waited in it."""
 
+KEPT_STALLS = 10
+"""Stalls that are remembered: a short one may come within `WAITED_NS` behind a long one."""
+
 PAUSE_NS = NS - MARGIN_NS
 """A silence of this length may arm a sender of a source whose senders pauses arm."""
 
@@ -143,8 +146,8 @@ class Witness:
         self.churned: set[str] = set()
         """Sources on which a program takes a new name for each message: it may fill their tables
         of senders."""
-        self._stalled = -NS, -NS
-        """Begin and end of the host's last stall, or of several that follow each other."""
+        self._stalls = [(-NS, -NS)]
+        """Begin and end of the host's last stalls. Those that follow each other are one."""
         self.stops: list[int] = []
         """Arrivals of the stops that no clear has released."""
         self.perhaps_latched: set[str] = set()
@@ -197,7 +200,7 @@ class Witness:
     def new_life(self, at_ns: int) -> None:
         """Note that the daemon started."""
         self.born_ns = at_ns
-        self._stalled = -NS, -NS
+        self._stalls = [(-NS, -NS)]
         if self.blocked_ns is not None:
             self.blocked_ns = at_ns  # this daemon has not yet had the time to find that out
         self.timeout = dict(self.file_timeout)
@@ -280,7 +283,7 @@ class Witness:
         elif zero and not waits:
             known.armed_ns = arrived_ns
         elif zero:
-            begun_ns, ended_ns = self._stalled
+            begun_ns, ended_ns = self._stalls[-1]
             stalled = begun_ns <= arrived_ns < ended_ns and ended_ns - begun_ns > LATE_NS
             known.zeros.append((ended_ns if stalled else arrived_ns, arrived_ns))
             del known.zeros[:-4000]
@@ -326,11 +329,14 @@ class Witness:
 
         The daemon refuses it `surely`, or perhaps: it notes a stall at its next step.
         """
-        begun_ns, ended_ns = self._stalled
         room_ns = 0 if surely else 2 * MARGIN_NS + self.period_ns
-        stalled = ended_ns - begun_ns > LATE_NS + MARGIN_NS + self.period_ns - room_ns
-        behind = begun_ns < wish.arrived_ns < ended_ns + WAITED_NS + room_ns
-        return wish.certain and bool(wish.v or wish.w) and stalled and behind
+        least_ns = LATE_NS + MARGIN_NS + self.period_ns - room_ns
+        behind = any(
+            ended_ns - begun_ns > least_ns
+            and begun_ns < wish.arrived_ns < ended_ns + WAITED_NS + room_ns
+            for begun_ns, ended_ns in self._stalls
+        )
+        return wish.certain and bool(wish.v or wish.w) and behind
 
     def _cancel_zeros(self, source: str, now_ns: int, sender: Sender) -> None:
         """Cancel the zeros of the source's shared identities, because one has sent a speed.
@@ -540,7 +546,7 @@ class Witness:
         end.
         """
         begun_ns = self.ending_ns
-        if begun_ns is None or self.blocked_ns is not None or self._stalled[1] > begun_ns:
+        if begun_ns is None or self.blocked_ns is not None or self._stalls[-1][1] > begun_ns:
             return
         due_ns = self.ramp_ns(True, moving) + LATE_NS + self.period_ns
         if self.last != ZERO and self.linked and due_ns < RAMPS_NS:
@@ -605,15 +611,16 @@ class Witness:
             for known in self.senders.values():
                 self._arm(known, begun_ns)
                 known.zeros = [(ns + lasts_ns, arrived_ns) for ns, arrived_ns in known.zeros]
-        before = self._stalled
+        before = self._stalls[-1]
         if begun_ns <= before[1]:
             begun_ns, ended_ns = before[0], max(before[1], ended_ns)
-        self._stalled = begun_ns, ended_ns
+            del self._stalls[-1]
+        self._stalls = [*self._stalls[-KEPT_STALLS:], (begun_ns, ended_ns)]
 
     def _silent(self, at_ns: int, fed_ns: int) -> bool:
         """Return whether the board has been silent for so long that the daemon must know it."""
         tolerance_ns = 2 * self.period_ns + MARGIN_NS
-        begun_ns, ended_ns = self._stalled
+        begun_ns, ended_ns = self._stalls[-1]
         stalled = begun_ns <= at_ns < ended_ns + tolerance_ns
         return at_ns - fed_ns > self.quiet_ns + tolerance_ns and not stalled
 

@@ -132,7 +132,7 @@ def roll(feedback: Line, *skipped: Line) -> Rolled:
     before = Skipped()
     for one in skipped:
         before.add(one)
-    return rolled_over(before, feedback, (10.0,) * 4, (10.0,) * 4, 4)
+    return rolled_over(before, feedback, (10.0,) * 4, (10.0,) * 4, (10.0,) * 4, 4)
 
 
 @each(
@@ -183,6 +183,37 @@ def test_a_false_speed_after_a_gap_or_in_a_long_line_does_not_make_a_wrong_pose_
     off, turned = math.dist((pose.x, pose.y), (way, 0.0)), abs(pose.yaw)
     assert turned < 1.2 * math.sqrt(covariance.yawyaw)
     assert off < 1.2 * math.sqrt(covariance.xx + covariance.yy)
+
+
+@each("wheels", MAPS)
+@each("end", ["before", "after"])
+@each("true", [-10.0, 10.0])
+@each(("silence", "gap"), [(0.1, 0.0), (0.3, 0.0), (0.9, 0.0), (0.0, 1.5)])
+def test_a_false_speed_beside_a_gap_takes_no_doubt_of_another_gap_away(
+    silence: float, gap: float, true: float, end: str, wheels: WheelMap
+) -> None:
+    """The robot was turned in the first gap. In the second one it rests, and one line is false."""
+    robot = Odometer(SURE, wheels=wheels)
+
+    def silent(speed: float, dt: float = 0.01) -> Line:
+        rear = speed if wheels is TWO else 0.0
+        speeds = WheelSpeeds(speed, 0.0, 0.0, rear)
+        return Line(AT, speeds, silence + dt if silence else 0.0, gap=gap, bridged=silence)
+
+    def rest() -> Estimate:
+        return [robot.fold(line(0.0), STILL) for _ in range(30)][-1]
+
+    rest()
+    robot.fold(silent(true), STILL)
+    before = rest().covariance
+    if end == "before":
+        robot.fold(replace(silent(-true), dt=0.01, gap=0.0, bridged=0.0))
+    turned = robot.pose.yaw
+    robot.fold(silent(0.0 if end == "before" else -true))
+    after = rest().covariance
+    off = abs(robot.pose.yaw - turned)
+    assert after.yawyaw >= before.yawyaw
+    assert off < 1.2 * math.sqrt(after.yawyaw - before.yawyaw)
 
 
 def accelerated(wheels: WheelMap, period: float) -> Estimate:

@@ -48,7 +48,7 @@ class Bench:
         command: WheelSpeeds | float | None = None,
         seconds: float = PERIOD,
         turn: float | None = None,
-        unseen: bool = False,
+        unseen: float = 0.0,
         noise: float = 0.0,
         each: float = PERIOD,
         until_fault: bool = False,
@@ -64,7 +64,7 @@ class Bench:
             a, b, c, d = (s + more * (s != 0.0) for s in speeds_of(speeds).as_tuple())
             turned = a * each, b * each, c * each, d * each
             by_gyro = None if turn is None else turn * each
-            wheels.commanded, wheels.unseen = wanted, each if unseen else 0.0
+            wheels.commanded, wheels.unseen = wanted, unseen
             reported = WheelSpeeds(a, b, c, d)
             wheels.add(turned, reported, each, by_gyro, self.feedback, self.kinematics, self.count)
             if wheels.status.excluded != before:
@@ -265,13 +265,33 @@ def test_what_sound_robots_do_is_no_fault() -> None:
         lowered.run(speed, command)
     # A board that stopped its motors in a stall: the lines of that time wait.
     again = Bench().driven()
-    again.run(0.0, 10.0, 0.5, unseen=True)
+    again.run(0.0, 10.0, 0.5, unseen=PERIOD)
     for step in range(100):
         again.run(0.09 * step, 0.1 * step)
     blind = Bench(encoders=False)
     blind.run(-10.0, 10.0, 5.0)
     assert slow.faults == lowered.faults == again.faults == blind.faults == []
     assert again.events == blind.events == []
+
+
+@each("wheels", MAPS)
+@each("counts", [0, 20])
+@each("silence", [1.1, 8.0])
+@each("before", [-17.0, 17.0])
+@each("after", [0.0, -3.0, 12.0])
+def test_the_speed_before_a_long_silence_is_no_motion_behind_it(
+    after: float, before: float, silence: float, counts: int, wheels: WheelMap
+) -> None:
+    """A hand turned the wheels, for too short a time for a fault."""
+    bench = Bench(counts, wheels=wheels).driven(1.0)
+    bench.run(before, 0.0, 0.2)
+    bench.wheels.tell(speeds_of(after))
+    bench.wheels.commanded, bench.wheels.unseen = speeds_of(after), silence
+    bench.wheels.add(
+        (0.0,) * 4, speeds_of(after), 0.0, None, bench.feedback, bench.kinematics, bench.count
+    )  # the first line behind a long silence has no time of its own
+    bench.run(after, after, 3.0)
+    assert bench.faults == []
 
 
 # wheels that the pose leaves out

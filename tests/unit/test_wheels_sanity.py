@@ -62,6 +62,11 @@ ROWS: dict[str, Row] = {
     "a damaged first line": (80, 1500, lines(79, 0, 0, 0), ".x.."),
     "a speed that no wheel reaches": (80, 1500, lines(79, 80.9, 80.9, 80.9), ".xxF"),
     "a jump from what two lines agreed on": (80, 1500, lines(0, 0, 79, 79, 79), "..xxF"),
+    # A wheel may change by as much in a long line, so a damaged one behind it proves nothing.
+    "damage behind a pause": (
+        80, 1500, [*lines(0, 0), line(0, dt=0.81, bridged=0.7), *lines(79, 0, 0, 0, 0)],
+        "....x...",
+    ),
     "a burst of lines": (
         80, 1500, [*lines(10, 10, step=0.0), *lines(17, 10, step=0.0, dt=0.001)], "....",
     ),

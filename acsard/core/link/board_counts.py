@@ -35,8 +35,9 @@ ROUNDING_MS = 2  # each of the two times is in whole ms
 # Excess over the least delay, which then rises; the session restarts after a gap of 1 s.
 MAX_DELAY_MS = 1000.0
 
-# Of driving, in a window of `CountsCheck`, and of a wheel.
-WINDOW_S, WINDOW_ANGLE = 5.0, 2 * math.tau
+# Of driving, in a window of `CountsCheck`, and of a wheel. A window without a difference is full
+# when it would have shown one of this share: the way there and back is the same by both.
+WINDOW_S, WINDOW_ANGLE, WINDOW_SHARE = 5.0, 2 * math.tau, 0.2
 
 # By which the angles of a wheel may differ: a share, counts (one at each end), rad/s by rounding,
 # and s by a filter of the speeds, times the change of the speed.
@@ -138,14 +139,17 @@ class CountsCheck(Struct):
             return None
         self.compared_s, self.compared = seconds, reported
         off = _wheels4([one - other for one, other in zip(counted, reported, strict=True)])
-        over = 1.0
+        over, known = 1.0, False
         wheels = zip(off, counted, reported, speeds, self.begin, strict=True)
         for wheel, (difference, one, other, now, then) in enumerate(wheels):
-            most = SHARE * max(abs(one), abs(other)) + EDGES * count + ROUNDING * seconds
-            beyond = abs(difference) / (most + FILTER_S * abs(now - then))
-            if beyond > over:
-                over, worst = beyond, wheel
+            size = max(abs(one), abs(other))
+            most = SHARE * size + EDGES * count + ROUNDING * seconds + FILTER_S * abs(now - then)
+            if abs(difference) / most > over:
+                over, worst = abs(difference) / most, wheel
+            if most < WINDOW_SHARE * size and (wheel == self.wheel or not self.differs):
+                known = True
         full = seconds >= WINDOW_S and max(map(abs, counted + reported)) >= WINDOW_ANGLE
+        full = full and (known or over > 1.0)
         suspected = over > 1.0 or (self.differs and not full)
         self.scaled = suspected and self._is_scaled(count)
         doubt = None

@@ -9,6 +9,7 @@ No sound line is repaired: a speed that may be false is used, and doubted as muc
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 from msgspec import Struct
 
@@ -45,6 +46,17 @@ class Skipped(Struct):
             self.turned = plus(self.turned, line.turned)
 
 
+class End(NamedTuple):
+    """One end of a gap: the speeds of its line that others confirm, and the rest of them.
+
+    `alone` are the angles that one speed of one line says and nothing else: if it is false, that
+    does not make the next one false.
+    """
+
+    speeds: Wheels4 = AT_REST  # rad/s
+    alone: Wheels4 = AT_REST  # rad
+
+
 class Rolled(Struct, frozen=True, gc=False):
     """The angles that the wheels rolled since the last plausible line, rad."""
 
@@ -53,15 +65,21 @@ class Rolled(Struct, frozen=True, gc=False):
     filled: Seconds  # part of `seconds` for which no line speaks
     unknown: Seconds  # in addition to `seconds`
     vague: Seconds = 0.0  # part of `seconds` that the last line may not cover
-    alone: Wheels4 = AT_REST  # part of `angles` that one speed of one line says, and nothing else
+    ends: tuple[End, End] = (End(), End())
 
 
 def rolled_over(
-    skipped: Skipped, line: Line, before: Wheels4, commanded: Wheels4, independent: int
+    skipped: Skipped,
+    line: Line,
+    before: Wheels4,
+    earlier: Wheels4,
+    commanded: Wheels4,
+    independent: int,
 ) -> Rolled:
-    """Return the angles since the last plausible line, which had the speeds `before`, rad/s.
+    """Return the angles since the last plausible line.
 
-    `independent` is the number of driven wheels.
+    It had the speeds `before`, and the one before it the speeds `earlier`, rad/s. `independent` is
+    the number of driven wheels.
     """
     speeds = line.speeds.as_tuple()
     if line.turned is not None:
@@ -77,13 +95,23 @@ def rolled_over(
         filled, unknown = 0.0, unknown + filled
     if filled:
         angles = plus(angles, times(plus(before, speeds), filled / 2))
-    alone = AT_REST
-    if line.by_counts is None:
+    ends = End(before), End(speeds)
+    if line.turned is None:
         count = (line.count or ASSUMED_COUNT) / max(line.dt, MIN_COUNT_S)
-        partner = speeds[::-1] if independent == len(speeds) else before
-        beyond = _beyond(speeds, (before, commanded, partner), count)
-        alone = times(beyond, line.dt - line.bridged + filled / 2)
-    return Rolled(angles, seconds + filled, filled, unknown, line.vague, alone)
+        half = (filled + min(unknown, MAX_FILLED_GAP_S)) / 2
+        partner, partner_before = before, earlier
+        if independent == len(speeds):
+            partner, partner_before = speeds[::-1], before[::-1]
+        ends = (
+            _end(before, (earlier, speeds, partner_before), count, half),
+            _end(speeds, (before, commanded, partner), count, line.dt - line.bridged + half),
+        )
+    return Rolled(angles, seconds + filled, filled, unknown, line.vague, ends)
+
+
+def _end(speeds: Wheels4, known: tuple[Wheels4, ...], count: RadPerS, seconds: Seconds) -> End:
+    beyond = _beyond(speeds, known, count)
+    return End(plus(speeds, times(beyond, -1.0)), times(beyond, seconds))
 
 
 def _beyond(speeds: Wheels4, known: tuple[Wheels4, ...], count: RadPerS) -> Wheels4:

@@ -28,6 +28,7 @@ from acsard.core.motion.uncertainty import (
     Uncertainty,
     pushed,
 )
+from acsard.core.motion.wheels import Wheels
 from acsard.core.values import (
     NS_PER_S,
     REST,
@@ -52,6 +53,7 @@ class Odometry(Struct):
     path: Path = Path()  # of base_link
     twist: Twist = REST  # in the last line
     speeds: WheelSpeeds = STILL  # in the last line
+    earlier: WheelSpeeds = STILL  # in the line before it
     positions: Wheels4 = AT_REST  # of the wheels, rad
     travelled: Metres = 0.0  # since the daemon started, forwards plus backwards
     skipped: Skipped = field(default_factory=Skipped)
@@ -93,8 +95,10 @@ class Odometry(Struct):
         reported, seconds = speeds.as_tuple(), line.dt
         if line.bridged or line.gap or line.vague or self.skipped.lines or seconds > LONG_S:
             commanded = (wheels.commanded or STILL).as_tuple()
-            before = self.speeds.as_tuple()
-            gap = rolled_over(self.skipped, line, before, commanded, model.independent)
+            gap = rolled_over(
+                self.skipped, line, self.speeds.as_tuple(), self.earlier.as_tuple(), commanded,
+                model.independent,
+            )  # fmt: skip
             self.skipped = Skipped()
             rolled, seconds = gap.angles, gap.seconds
         else:
@@ -128,7 +132,7 @@ class Odometry(Struct):
         if turn is not None:
             angle, angular, variance = turn.angle, turn.rate, turn.variance
         self.travelled += abs(distance)
-        last, self.twist, self.speeds = self.twist, Twist(linear, angular), speeds
+        self.twist, self.earlier, self.speeds = Twist(linear, angular), self.speeds, speeds
 
         pose, path, uncertainty = self.pose, self.path, self.uncertainty
         state = at_rest, slips, turn is not None
@@ -163,7 +167,7 @@ class Odometry(Struct):
             if gap:
                 at_ns = line.at.mono_ns
                 rests = rested and at_rest and line.driven <= 0.0
-                self._doubt_gap(gap, last, at_ns, rests, turn is not None, heading, model)
+                self._doubt_gap(gap, wheels, at_ns, rests, turn is not None, heading, model)
             self.set_ns = 0
             if self.late != REST:
                 angle = 0.0 if turn is not None else self.late.angular
@@ -200,19 +204,22 @@ class Odometry(Struct):
     def _doubt_gap(
         self,
         gap: Rolled,
-        before: Twist,
+        wheels: Wheels,
         at_ns: Ns,
         rests: bool,
         by_gyro: bool,
         heading: Rad,
         model: ErrorModel,
     ) -> None:
-        after, uncertainty, filled, unknown = self.twist, self.uncertainty, gap.filled, gap.unknown
-        linear, angular = before.linear - after.linear, before.angular - after.angular
+        uncertainty, filled, unknown = self.uncertainty, gap.filled, gap.unknown
         turns = 0.0 if by_gyro else 1.0  # a gyro misses no turn
-        if gap.alone != AT_REST:
-            distance, angle = model.kinematics.moved(gap.alone)
-            uncertainty.miss("gap", -distance, -turns * angle, heading)
+        moved, (last, first) = model.kinematics.moved, gap.ends
+        for alone in (last.alone, first.alone):
+            if alone != AT_REST:
+                distance, angle = moved(alone)
+                uncertainty.doubt(distance**2, turns * angle**2, 0.0, heading)
+        (v, w), (v_after, w_after) = (moved(wheels.believed(end.speeds)) for end in gap.ends)
+        linear, angular = v - v_after, w - w_after
         # The speed may have changed at the begin of the lost time, or at its end, and the next time
         # alike: a robot that stops in each silence always stops as late.
         late = filled / 3 + gap.vague / 2
@@ -231,8 +238,7 @@ class Odometry(Struct):
                 min(unknown, MAX_FILLED_GAP_S) / 2,
                 model.in_gap(unknown, uncertainty.period, rests),
             )
-            distance = half * (before.linear + after.linear)
-            angle = half * (before.angular + after.angular)
+            distance, angle = half * (v + v_after), half * (w + w_after)
             uncertainty.miss("gap", distance, turns * angle, heading)
             # The motion may be an arc to either side.
             aside = (distance**2 + along) * min(1.0, (angle**2 + yaw) / 4)

@@ -5,8 +5,8 @@ several in a row are a fault. More than one in a hundred is a warning: damage on
 limit in `[feedback]` that is too low. One count in a short time looks like a high speed, so the
 angles decide: what a wheel turns beyond the limit, over all lines, may be one count, or two by the
 speeds alone. A change may be larger by two counts. It counts from the last possible line. Until two
-lines have agreed, it is possible if the line agrees with the one before it: the first line may be
-damaged, and then the true ones look impossible.
+lines have agreed within a short time, it is possible if the line agrees with the one before it: the
+first line may be damaged, and then the true ones look impossible.
 """
 
 from __future__ import annotations
@@ -109,7 +109,9 @@ class Sanity(Struct):
             if self.dropped == int(WARNING_FRACTION * WINDOW_LINES) + 1:
                 self.warning = Event("lines_implausible", self._warning_text(why), "warning")
         else:
-            self.trusted = possible is not None
+            # A comparison that no speed fails proves nothing.
+            passed = math.inf if possible is None else now.middle - possible.middle
+            self.trusted = MAX_WHEEL_ACCELERATION * passed < fastest
             self.possible, self.count, self.dropped_s = now, 0, 0.0
         if self.lines == WINDOW_LINES:
             self.lines = self.dropped = 0

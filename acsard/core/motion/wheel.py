@@ -124,6 +124,11 @@ class Wheel(Struct):
             return "wheel_blocked" if stands else self.warning or "wheel_slow"
         return None if self.agrees and not slow and not beyond else self.warning
 
+    def stand(self) -> None:
+        """Smooth the speed from rest."""
+        self.speed = self.sure_speed = 0.0
+        self.obedience.speeds = [0.0] * len(self.obedience.speeds)
+
     def forget(self) -> None:
         """Another fault needs new evidence."""
         self.obedience.forget()

@@ -27,7 +27,6 @@ from acsard.core.motion.obedience import (
     DEAD_TIME_S,
     DELAYS,
     NOISE_COUNTS,
-    Obedience,
 )
 from acsard.core.motion.sides import (
     OUT_ANGLE,
@@ -202,7 +201,8 @@ class Wheels(Struct):
     def _drop(self) -> None:
         self.begins = True
         for wheel in self.wheels:
-            wheel.speed, wheel.sure_speed, wheel.obedience = 0.0, 0.0, Obedience()
+            wheel.stand()
+            wheel.obedience.forget()
             wheel.fast_s = wheel.fast_angle = 0.0
         self.standstill.forget()
 
@@ -269,6 +269,12 @@ class Wheels(Struct):
         pairs = zip(self.wheels, ends, strict=False)
         speeds = [_nearer(wheel.speed, speed) if short else 0.0 for wheel, speed in pairs]
         before = [(*side.told, *side.smooth) for side in self.sides]
+        if not short:
+            # Smoothing begins again.
+            for side in self.sides:
+                side.smooth = 0.0, 0.0, 0.0
+            for wheel in self.wheels:
+                wheel.stand()
         unknown = [side for side in self.sides if not any(speeds[i] for i in side.wheels)]
         for _ in range(_steps(s, step_s)):
             self._begin_step()
