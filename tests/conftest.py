@@ -20,6 +20,7 @@ import pytest
 from hypothesis import settings
 from xdist.scheduler import LoadScopeScheduling
 
+from tests import produced
 from tests.each import run
 
 # A failed assertion in these helpers shows its values, as it does in a test.
@@ -82,6 +83,10 @@ LOUD = (
 
 One worker runs all of them and `bench`, one after the other: they would disturb each other.
 """
+
+
+pytest_plugins = ("tests.produced",)
+produced.install()
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:

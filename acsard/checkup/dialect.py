@@ -14,6 +14,7 @@ from acsard.checkup import lateness, motion, outcomes
 from acsard.checkup.board import Board
 from acsard.checkup.findings import Finding, StoppedError, motor_name
 from acsard.checkup.motion import BOOT_S, SHORT_MEASUREMENT_S, WATCHDOG_SILENCE_S, BoardReply
+from acsard.core.codes import CODES
 from acsard.core.config.settings import MAX_REPLY_PERIOD_S, Baud
 from acsard.core.config.wire_time import COMFORTABLE_USE, highest_rate, line_bytes
 from acsard.core.formatting import printable_bytes
@@ -47,14 +48,11 @@ def baud(board: Board) -> Finding:
                 heard=data.counted,
             )
     board.open(configured)
+    # The daemon says the same about bytes that are no good lines.
+    why = data.reason(f"at {configured} baud {{}}; no good line at any other rate")
+    figure = CODES[why.code].figure
     raise StoppedError(
-        outcomes.find(
-            f"baud rate: {data.code}",
-            heard=data.counted,
-            configured=configured,
-            example=board.example,
-            wheels=data.wheels,
-        )
+        Finding("baud rate", "FAIL", figure, why.text.rstrip(";"), why.advice, {}, why.code)
     )
 
 

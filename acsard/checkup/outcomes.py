@@ -2,16 +2,11 @@
 
 from __future__ import annotations
 
-import re
-
-from msgspec import Struct, convert
+from msgspec import convert
 
 from acsard.checkup.findings import Finding, Verdict
+from acsard.core.tables.finding_table import code_of, table
 
-# Each entry has this form:
-# VERDICT step: outcome | figure
-#     the meaning
-#     -> the remedy
 # A "?" after the verdict marks an outcome that this computer can cause by running the check too
 # late, even if the board works correctly.
 OUTCOMES = """
@@ -19,55 +14,6 @@ PASS baud rate: right | {rate} baud
 FAIL baud rate: other | {rate}, not {configured} baud
     {heard} at the configured {configured} baud; good lines at {rate}
     -> write mcu.baud_rate = {rate}; the check goes on with it
-FAIL baud rate: received_nothing | nothing received
-    {heard} at {configured} baud, and no good line at any other rate
-    -> is this the right port (`acsard ports`), does the board have power, does its firmware answer
-    `{example}` (the letters are those of mcu.wheels), are TX and RX swapped?
-FAIL baud rate: received_text | text instead of replies
-    at {configured} baud {heard}; no good line at any other rate
-    -> the baud rate is right. Is this the board (`acsard ports`)? Then its firmware prints other
-    text: remove its Serial.print, and let it answer each line
-FAIL baud rate: received_form | replies in another form
-    at {configured} baud {heard}; no good line at any other rate
-    -> the lines are whole, but the firmware must send `{example}`: p or n as the sign, and two
-    digits, a point and two digits in each figure, without spaces
-FAIL baud rate: received_letters | other motors
-    at {configured} baud {heard}; no good line at any other rate
-    -> the lines are whole, but do not name each motor of mcu.wheels once: {wheels}; the check then
-    finds out which motor turns which wheel
-FAIL baud rate: received_cut | pieces of lines
-    at {configured} baud {heard}; no good line at any other rate
-    -> the firmware cuts its replies short or omits the line end: it must send all values and
-    Serial.println() in one reply; is its send buffer too small, or does it restart while it writes?
-FAIL baud rate: received_foreign | other bytes in the lines
-    at {configured} baud {heard}; no good line at any other rate
-    -> the baud rate is right, but other bytes are on the line: a debug print of the firmware, or
-    writes of a second program to this port. If it is neither, it is noise: use one ground for board
-    and computer, and a short cable away from the motors' leads
-FAIL baud rate: received_garbage | only garbage
-    at {configured} baud {heard}; no good line at any other rate
-    -> does the firmware send at 9600 to 500000 baud, at TTL level and not RS-232? is this the right
-    port (`acsard ports`), and is the board's ground connected to the computer's?
-FAIL baud rate: received_brownout | the board starts again and again
-    at {configured} baud {heard}: its supply voltage is too low
-    -> give the board a supply of its own or a thicker cable: starting motors pull down the voltage
-FAIL baud rate: received_boot | the board starts again and again
-    at {configured} baud {heard}
-    -> does its supply break down, or does an error in its firmware restart it?
-FAIL baud rate: received_nmea | another device
-    at {configured} baud {heard}: this is what a GPS receiver sends
-    -> name the port of the board: `acsard ports` lists all
-FAIL baud rate: received_few | few good lines
-    at {configured} baud {heard}; fewer good lines at any other rate
-    -> use a short cable away from the motors' leads, a common ground, or a lower baud rate at both
-    ends
-FAIL baud rate: received_statuses | only status lines
-    at {configured} baud {heard}; no good line at any other rate
-    -> the board hears nothing: connect this computer's TX to the board's RX
-FAIL baud rate: received_sparse | good lines, but too seldom
-    at {configured} baud {heard}; no good line at any other rate
-    -> the board must answer each line, or report by its own clock at least every 0.25 s; does
-    delay() or a slow print block its loop?
 
 PASS identification: named | {short}
     {text}
@@ -394,10 +340,10 @@ FAIL restarts: gone | {times}
     the board restarted {told}, and did not answer again within {patience:g} s
     -> switch it off and on; does its bootloader hang after a reset by the watchdog, or does its
     supply fail?
-FAIL? link: silent | silent for {seconds:.1f} s
+FAIL? link: stops | silent for {seconds:.1f} s
     the microcontroller stopped replying while it had to turn {motors}
     -> does its supply dip when a motor starts, so that it restarts? is a cable loose?
-FAIL? link: silent at zeros | silent for {seconds:.1f} s
+FAIL? link: stops at zeros | silent for {seconds:.1f} s
     the microcontroller stopped replying while this computer sent it only zeros
     -> is a cable or plug loose? did its supply fail, or does its firmware hang?
 WARN late: not judged | not judged
@@ -420,49 +366,23 @@ class TimingFinding(Finding, frozen=True):
     margin_s: float = 0.0
 
 
-class Outcome(Struct, frozen=True):
-    """One possible outcome of a step, with the format strings of its finding.
-
-    `unsure` says whether a computer that runs the check too late can cause this outcome.
-    """
-
-    verdict: Verdict
-    unsure: bool
-    figure: str
-    text: str
-    mend: str
-
-
-def _parse_manual(manual: str) -> dict[str, Outcome]:
-    outcomes = {}
-    for entry in re.split(r"\n+(?! )", manual.strip()):
-        head, *rest = entry.splitlines()
-        verdict, _, head = head.partition(" ")
-        outcome, _, figure = head.partition(" | ")
-        text, _, mend = " ".join(line.strip() for line in rest).partition("-> ")
-        parts = {"verdict": verdict.rstrip("?"), "unsure": verdict.endswith("?"), "figure": figure}
-        outcomes[outcome] = convert(parts | {"text": text.strip(), "mend": mend}, Outcome)
-    return outcomes
-
-
-# Maps the name of each outcome, such as "baud rate: right", to the outcome.
-OUTCOMES_BY_NAME = _parse_manual(OUTCOMES)
+OUTCOMES_BY_CODE = table(None, OUTCOMES)
 
 
 def find(outcome: str, keys: dict[str, object] | None = None, **values: object) -> Finding:
-    """Return the finding for an outcome, a key of `OUTCOMES_BY_NAME`, with the values in its texts.
+    """Return the finding for an outcome such as "baud rate: right", with the values in its texts.
 
     The value `name` replaces the name of the finding, and `margin_s` is stored if the outcome is
     unsure.
     """
-    entry = OUTCOMES_BY_NAME[outcome]
-    name = str(values.get("name", outcome.partition(":")[0]))
-    figure, text, mend = (s.format(**values) for s in (entry.figure, entry.text, entry.mend))
-    code = re.sub(r"\W+", "_", outcome.partition(": ")[2])
+    code = code_of(outcome)
+    entry = OUTCOMES_BY_CODE[code]
+    name, verdict = str(values.get("name", entry.subject)), convert(entry.mark, Verdict)
+    figure, text, mend = (s.format(**values) for s in (entry.figure, entry.text, entry.advice))
     if not entry.unsure:
-        return Finding(name, entry.verdict, figure, text, mend, keys or {}, code)
+        return Finding(name, verdict, figure, text, mend, keys or {}, code)
     margin_s = float(str(values.get("margin_s", 0.0)))
-    return TimingFinding(name, entry.verdict, figure, text, mend, keys or {}, code, margin_s)
+    return TimingFinding(name, verdict, figure, text, mend, keys or {}, code, margin_s)
 
 
 def plain(finding: Finding) -> Finding:

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from typing import Literal
 
-from acsard.core.codes import PoseCode
 from acsard.core.link.board_status import as_text
 from acsard.core.messages.schema import BatterySummary, Cause, RobotState, SourceState, Time
 from acsard.core.messages.snapshot import Snapshot
 from acsard.core.motion.arbiter_text import waiting
 from acsard.core.robot import Robot
+from acsard.core.tables.pose_codes import PoseCode
 from acsard.core.values import NS_PER_S, BatteryStatus, GyroStatus, Ns
 from acsard.core.values import Cause as LatchedCause
 

@@ -11,13 +11,10 @@ from typing import TYPE_CHECKING, Annotated, Literal, get_args
 
 from msgspec import Meta, Struct
 
-from acsard.core.codes import (
-    Code,
-    GuardCode,
-    ObjectionCode,
-    RefusalCode,
-    WaitCode,
-)
+from acsard.core.codes import Code, RefusalCode
+from acsard.core.tables.message_codes import ObjectionCode
+from acsard.core.tables.motor_codes import GuardCode
+from acsard.core.tables.sender_codes import WaitCode
 
 # The order of every value with one item per wheel. If only two wheels are driven, their values are
 # the first two, and those of the rear wheels are equal to them.

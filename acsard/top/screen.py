@@ -22,7 +22,7 @@ from acsard.core.formatting import lasting, printable, rough, signed
 from acsard.core.messages.schema import Info, RobotState, SourceState
 from acsard.core.messages.short_texts import cause_numbers, power
 from acsard.core.messages.state_warnings import WARNING, brief, warnings
-from acsard.core.motion.gyro import STATUS_TEXTS
+from acsard.core.motion.gyro import STATUS
 from acsard.core.values import NS_PER_S, TWO_WHEELS
 from acsard.daemon.latencies import NAMES
 from acsard.terminal.output import table
@@ -224,7 +224,7 @@ def _facts(data: ScreenData, state: RobotState) -> Table:
         where = "the built-in SIMULATOR" if data.info.simulated else clean(data.info.port)
         rows.append(("port", where))
     if state.gyro != "off":
-        words = {str(does): f"{does}: {text}" for does, text in STATUS_TEXTS.items()}
+        words = {str(does): f"{does}: {why.text}" for does, why in STATUS.items()}
         rows.append(("gyro", words.get(state.gyro, clean(state.gyro))))
     if inputs := _board(state):
         rows.append(("board", inputs))

@@ -13,7 +13,6 @@ import math
 
 from msgspec import Struct, field
 
-from acsard.core.codes import AgeCode
 from acsard.core.config.settings import CommandsConfig, Source
 from acsard.core.link.step_times import CATCH_UP_NS
 from acsard.core.motion.ages import MARGIN_NS, MAX_CLOCKS, SILENT_NS, Ages, Order
@@ -26,6 +25,7 @@ from acsard.core.motion.neutral import (
     Sender,
     is_zero,
 )
+from acsard.core.tables.sender_codes import AgeCode
 from acsard.core.values import (
     BRIDGES,
     NS_PER_S,
