@@ -20,7 +20,6 @@ import pytest
 from hypothesis import settings
 from xdist.scheduler import LoadScopeScheduling
 
-from tests import produced
 from tests.each import run
 
 # A failed assertion in these helpers shows its values, as it does in a test.
@@ -86,7 +85,6 @@ One worker runs all of them and `bench`, one after the other: they would disturb
 
 
 pytest_plugins = ("tests.produced",)
-produced.install()
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:

@@ -143,6 +143,8 @@ class Board:
         # Whether a motor runs away, or keeps turning although zeros are sent. The check sends
         # nothing more in this case, so that the board's watchdog can stop the motor.
         self.runaway_seen = False
+        # rad/s, above which a motor runs away
+        self.most_speed = motion.RUNAWAY_SPEED
 
         self._commanded = self.zero
         # Time for which `drive` has sent lines since the last reply. If this computer is late, only
@@ -414,7 +416,7 @@ class Board:
         return self.now_s - self.replies[-1].at_s if self.replies and not self.runaway_seen else 0.0
 
     def _guard(self) -> None:
-        runaway = motion.runaway(self.replies)
+        runaway = motion.runaway(self.replies, self.most_speed)
         if runaway is None:
             return
         motor, speed = runaway

@@ -111,15 +111,17 @@ def _answers(board: Board, comma: bool) -> list[BoardReply]:
     return [reply for _, reply in board.answers(5, SHORT_MEASUREMENT_S / 6, comma)]
 
 
-def comma(board: Board, dead: bool) -> Finding:
+def comma(board: Board, kind: str) -> Finding:
     """Return the finding about `mcu.trailing_comma`, after the test of the last motor.
 
-    Some firmware turns or stops the last motor only if the line ends with a comma. `dead` says that
-    its movement was not seen.
+    Some firmware turns or stops the last motor only if the line ends with a comma. `kind` is that
+    of this motor.
     """
     if board.comma != board.mcu.trailing_comma:
         return _comma_wrong(board, "latched" if board.latched and board.comma else "disobeyed")
-    if dead:
+    if kind == "late":
+        return lateness.finding("trailing comma", board.lateness.since(0.0))
+    if kind == "dead":
         return outcomes.find("trailing comma: dead", last=board.letters[-1])
     how = "sent" if board.comma else "not sent"
     return outcomes.find(f"trailing comma: {how}", {"mcu.trailing_comma": board.comma})

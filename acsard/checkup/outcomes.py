@@ -59,6 +59,12 @@ FAIL? reply rate: none | too few replies
     the board leaves lines unanswered
     -> the firmware must answer every line, or report by its own clock
 
+PASS reply times: even | p50 {usual:.0f} ms, p99 {high:.0f} ms, max {longest:.0f} ms apart
+WARN? reply times: bunched | p50 {usual:.0f} ms, p99 {high:.0f} ms, max {longest:.0f} ms apart
+    {share:.0%} of the replies come in bunches behind silences: something blocks the firmware's
+    loop, so commands wait as long, and the pose is less certain
+    -> which library, delay() or print in the loop takes {longest:.0f} ms? Let the loop never wait
+
 PASS round trip: right | p50 {middle:.1f} ms, max {longest:.1f} ms
 WARN? round trip: slow | p50 {middle:.1f} ms, max {longest:.1f} ms
     the wheel speeds arrive late
@@ -187,6 +193,13 @@ WARN measured speeds: set points | none
     -> watch each wheel while its motor turns
 SKIPPED wheel map: not seen
     no person watched: the check assumes the configured wheel and direction of each motor
+WARN wheel map: partly
+    nobody said which wheel these turn: {motors}; the others turn the configured wheels
+    -> check again, and watch all wheels
+WARN wheel map: faulty
+    you saw {answers}, which differs from the configuration, but these motors have faults (see
+    above)
+    -> fix the motors above, and check again
 PASS wheel map: right | {map}
 FAIL wheel map: other | {map}
     this differs from the configuration: {wheels}
@@ -202,7 +215,24 @@ WARN? least speed: large | {least:g} rad/s
     -> let the firmware control the speed of the motors (the sketch does), or raise the least speed
     of the planner above this
 SKIPPED least speed: untested
-    no motor followed its commands
+    no motor turned forward as commanded
+    -> fix the motors above, and check again
+PASS top speed: reached | {top:.1f} rad/s
+WARN? top speed: short | {most:.1f} of {speed:.1f} rad/s
+    the limits allow {top:.1f} rad/s, which is {way:.2f} m/s at the wheel, but this motor or these
+    stay behind, with the wheels in the air: {motors}. The daemon then says that the wheel is slow
+    -> write a lower limits.linear_speed or limits.angular_speed, or check the supply of the motors
+FAIL top speed: overflow | {most:.1f} at {speed:.1f} rad/s
+    up to {below:.1f} rad/s the board reports the right direction; on the way to {speed:.1f} rad/s
+    this motor or these are reported backward: {motors}. A number in the firmware overflows, and the
+    daemon would take that for a wheel that turns the wrong way
+    -> compute and send speeds in a wider type (float, or 32 bits); until then write limits below
+    {below:.1f} rad/s
+SKIPPED top speed: no watchdog
+    the watchdog of the board is not known to work, so the check does not turn the motors fast
+    -> fix the watchdog above, and check again
+SKIPPED top speed: untested
+    no motor turned forward as commanded
     -> fix the motors above, and check again
 SKIPPED encoder counts: none
     the firmware sends no counts
@@ -236,7 +266,8 @@ FAIL encoder counts: wrong | {counts}, not {configured}
     -> write mcu.encoder_counts = {counts}
 
 SKIPPED watchdog: untested
-    no motor followed its commands, so none can show whether the watchdog works
+    no encoder showed a motor that turns forward when commanded, so none can show whether the
+    watchdog works
     -> fix the motors above, and check again
 FAIL? watchdog: weak
     motors {letters} turned one by one, but not together: is the supply too weak?
@@ -264,7 +295,7 @@ PASS? watchdog: right | {figure}
     300 ms is right
 
 SKIPPED damaged lines: untested
-    no motor followed its commands, so none can show whether the board obeys damaged lines
+    no motor turned forward as commanded, so none can show whether the board obeys damaged lines
     -> fix the motors above, and check again
 PASS? damaged lines: right | {lines} lines, no motor moved
 WARN damaged lines: lenient | {took} of {kinds} kinds obeyed
