@@ -44,7 +44,14 @@ def summary(robot: Robot, now_ns: Ns) -> Snapshot:
             source=status.source,
             sources=[
                 SourceState(
-                    s.name, s.priority, s.age_s, waiting(s.waits_for).text, s.waits_for.what
+                    s.name,
+                    s.priority,
+                    s.age_s,
+                    waiting(s.waits_for).text,
+                    s.waits_for.what,
+                    s.twist.linear if s.twist else None,
+                    s.twist.angular if s.twist else None,
+                    s.longest_gap_s,
                 )
                 for s in sources
             ],

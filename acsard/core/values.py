@@ -324,13 +324,15 @@ class SourceStatus(Struct, frozen=True):
     """The state of a command source.
 
     `age_s` is the time since its last accepted command, s, and None after an event that requires a
-    zero.
+    zero. `twist` is that of this command.
     """
 
     name: str
     priority: int
     age_s: float | None
     waits_for: Wait
+    twist: Twist | None = None
+    longest_gap_s: Seconds = 0.0  # between a speed and the next command, in the last minute
 
 
 class WheelsStatus(Struct, frozen=True):

@@ -206,16 +206,22 @@ def _sources(state: RobotState) -> Table:
     return _table(("sources", "priority", "seen", "waits for"), rows, (1, 2))
 
 
+SHOWN_GAP_S = 0.25  # the default timeout of a source
+
+
 def _drives(source: SourceState, state: RobotState) -> bool:
     return source.name == state.source and state.mode == "driving" and not source.waits_for
 
 
 def _waits(source: SourceState, state: RobotState) -> str:
-    if source.waits_for:
-        return clean(source.waits_for)
+    parts = [clean(source.waits_for) or f"nothing, but the robot is {clean(state.mode)}"]
     if _drives(source, state):
-        return "nothing: it drives"
-    return f"nothing, but the robot is {clean(state.mode)}"
+        parts = ["nothing: it drives"]
+    elif source.wait == "neutral" and source.linear is not None and source.angular is not None:
+        parts.append(f"it sends {source.linear:.3f} m/s, {source.angular:.3f} rad/s")
+    if source.longest_gap > SHOWN_GAP_S:
+        parts.append(f"commands up to {source.longest_gap:.1f} s apart")
+    return "; ".join(parts)
 
 
 def _facts(data: ScreenData, state: RobotState) -> Table:

@@ -126,7 +126,7 @@ def diagnostics(
         _mode(snapshot.state),
         _serial_link(config, snapshot),
         _control_loop(snapshot),
-        _commands(snapshot),
+        _commands(config, snapshot),
         _wheels(config, snapshot),
         *_board(config, snapshot),
         *_battery(config, snapshot),
@@ -218,7 +218,8 @@ def _control_loop(snapshot: Snapshot) -> Row:
     return Row("control loop", [why], values)
 
 
-def _commands(snapshot: Snapshot) -> Row:
+def _commands(config: Config, snapshot: Snapshot) -> Row:
+    timeouts = {source.name: source.timeout for source in config.commands.sources}
     values = {s.name: waiting(s.waits_for).text or "driving" for s in snapshot.sources}
     values |= _counted(snapshot.state.counters, "command")
     driver = snapshot.state.source
@@ -229,6 +230,22 @@ def _commands(snapshot: Snapshot) -> Row:
         if source.waits_for.what == "senders":
             senders = source.waits_for.senders + 1
             findings.append(reason("shared_source", senders=senders, source=source.name))
+        timeout = timeouts.get(source.name, source.longest_gap_s)
+        if source.longest_gap_s > timeout:
+            gap_s = source.longest_gap_s
+            findings.append(
+                reason("command_gaps", source=source.name, seconds=gap_s, timeout=timeout)
+            )
+        if source.waits_for.what == "neutral" and source.waits_for.lasts and source.twist:
+            twist = source.twist
+            findings.append(
+                reason(
+                    "never_zero",
+                    source=source.name,
+                    linear=twist.linear,
+                    angular=twist.angular,
+                )
+            )
     age_s = snapshot.refused_age_s
     if age_s is not None and age_s < SHOW_REFUSAL_S:
         findings.append(reason("refused", refused=snapshot.state.refused))

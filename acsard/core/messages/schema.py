@@ -350,6 +350,16 @@ class SourceState(Message, frozen=True):
     - higher, equal: a source of higher or of the same priority controls the robot.
     - senders: other senders of this source wait until the sender that drives falls silent.
     """
+    linear: float | None = None
+    """Forward speed in the last accepted command, m/s; null like `age`."""
+    angular: float | None = None
+    """Turn rate in the last accepted command, rad/s; null like `age`."""
+    longest_gap: float = 0.0
+    """Longest time between a speed and the next command of its sender in the last 30 to 60 s, s.
+
+    In a gap above the timeout of the source the robot has braked. A gap above 5 s is the end of a
+    drive, and does not count.
+    """
 
 
 class Spread(Message, frozen=True):

@@ -20,7 +20,7 @@ WaitCode = Literal[
 SenderCode = Literal[WaitCode, "commanded", "limits_zero", "no_command"]
 
 # Of all sources together in `diagnostics`.
-SourcesCode = Literal["refused", "shared_source"]
+SourcesCode = Literal["refused", "shared_source", "command_gaps", "never_zero"]
 
 SENDERS = table(
     Literal[SenderCode, SourcesCode],
@@ -102,6 +102,15 @@ WARN senders
     {others} of this source must wait until the sender that drives falls silent
 WARN refused
     refused: {refused}
+WARN command_gaps
+    commands of {source} came up to {seconds:.1f} s apart, but count for {timeout:g} s: the robot
+    braked in between
+    -> let the program send at a steady rate, with a timer of its own; `acsard echo state` shows
+    longest_gap of each source
+WARN never_zero
+    {source} sends {linear:.3f} m/s and {angular:.3f} rad/s, and no zero for over 3 s
+    -> if nobody moves it, this is the offset of the stick: let its program send zeros below it (a
+    dead zone)
 WARN shared_source
     {senders} programs send as {source}, and the robot follows one of them
     -> end the other programs, or give each program its own source
