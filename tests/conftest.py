@@ -84,6 +84,9 @@ One worker runs all of them and `bench`, one after the other: they would disturb
 """
 
 
+pytest_plugins = ("tests.produced",)
+
+
 def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption("--approve", action="store_true", help="write the approved texts anew")
 

@@ -22,6 +22,7 @@ import zenoh
 from msgspec.structs import replace
 from ruamel.yaml import YAML
 
+from acsard.core.codes import reason
 from acsard.core.config.settings import DIAGNOSTICS_HZ, BusConfig, Config, RosConfig, WheelMap
 from acsard.core.messages.diagnostics import diagnostics
 from acsard.core.motion.neutral import NEUTRAL_PAUSE_NS
@@ -421,7 +422,9 @@ def row_names() -> list[str]:
         latch_file="",
         board={"emergency_stop": "released"},
     )
-    rows = diagnostics(config, OUTPUTS.now, snapshot, ("valid", "valid for a year")).status
+    rows = diagnostics(
+        config, OUTPUTS.now, snapshot, reason("certificate_valid", where="", days=365, of="")
+    ).status
     return [row.name for row in rows]
 
 

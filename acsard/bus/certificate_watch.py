@@ -16,7 +16,7 @@ from acsard.bus.tls_files import expiry_times, peer_ends_ns, unusable
 from acsard.bus.tls_trouble import RENEW_ADVICE
 from acsard.bus.zenoh_sessions import certificate_trouble
 from acsard.core.config.settings import BusConfig
-from acsard.core.messages.certificate_expiry import CERTIFICATE_LEVELS, expiry
+from acsard.core.messages.certificate_expiry import expiry, short_code
 from acsard.core.values import NS_PER_S, Event, WallNs
 from acsard.host import clock
 from acsard.host.threads import NoThreadError, in_thread
@@ -118,7 +118,8 @@ async def watch_certificates(
 def _tell_of_change(known: Mapping[str, WallNs], said: str, tell: Callable[[Event], None]) -> str:
     if not known:
         return said
-    code, text = expiry(known, clock.now().wall_ns)
-    if code != said and CERTIFICATE_LEVELS[code]:
-        tell(Event("certificate", f"{text}; {RENEW_ADVICE}", "warning", kind=code))
-    return code
+    why = expiry(known, clock.now().wall_ns, RENEW_ADVICE)
+    if why.code != said and why.level != "ok":
+        text = f"{why.text}; {why.advice}"
+        tell(Event("certificate", text, "warning", kind=short_code(why), code=why.code))
+    return why.code

@@ -143,6 +143,8 @@ class Board:
         # Whether a motor runs away, or keeps turning although zeros are sent. The check sends
         # nothing more in this case, so that the board's watchdog can stop the motor.
         self.runaway_seen = False
+        # rad/s, above which a motor runs away
+        self.most_speed = motion.RUNAWAY_SPEED
 
         self._commanded = self.zero
         # Time for which `drive` has sent lines since the last reply. If this computer is late, only
@@ -320,7 +322,7 @@ class Board:
 
     def _silence(self, motors: Motors, seconds: float) -> StoppedError:
         turned = [motor for motor, speed in enumerate(motors) if speed]
-        outcome = "link: silent" if turned else "link: silent at zeros"
+        outcome = "link: stops" if turned else "link: stops at zeros"
         names = motor_names(self.mcu, turned)
         # A delay of this computer that is much shorter than the silence cannot cause it.
         beyond_s = seconds - self._max_silence_s
@@ -414,7 +416,7 @@ class Board:
         return self.now_s - self.replies[-1].at_s if self.replies and not self.runaway_seen else 0.0
 
     def _guard(self) -> None:
-        runaway = motion.runaway(self.replies)
+        runaway = motion.runaway(self.replies, self.most_speed)
         if runaway is None:
             return
         motor, speed = runaway

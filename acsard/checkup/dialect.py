@@ -14,6 +14,7 @@ from acsard.checkup import lateness, motion, outcomes
 from acsard.checkup.board import Board
 from acsard.checkup.findings import Finding, StoppedError, motor_name
 from acsard.checkup.motion import BOOT_S, SHORT_MEASUREMENT_S, WATCHDOG_SILENCE_S, BoardReply
+from acsard.core.codes import CODES
 from acsard.core.config.settings import MAX_REPLY_PERIOD_S, Baud
 from acsard.core.config.wire_time import COMFORTABLE_USE, highest_rate, line_bytes
 from acsard.core.formatting import printable_bytes
@@ -47,14 +48,11 @@ def baud(board: Board) -> Finding:
                 heard=data.counted,
             )
     board.open(configured)
+    # The daemon says the same about bytes that are no good lines.
+    why = data.reason(f"at {configured} baud {{}}; no good line at any other rate")
+    figure = CODES[why.code].figure
     raise StoppedError(
-        outcomes.find(
-            f"baud rate: {data.code}",
-            heard=data.counted,
-            configured=configured,
-            example=board.example,
-            wheels=data.wheels,
-        )
+        Finding("baud rate", "FAIL", figure, why.text.rstrip(";"), why.advice, {}, why.code)
     )
 
 
@@ -113,15 +111,17 @@ def _answers(board: Board, comma: bool) -> list[BoardReply]:
     return [reply for _, reply in board.answers(5, SHORT_MEASUREMENT_S / 6, comma)]
 
 
-def comma(board: Board, dead: bool) -> Finding:
+def comma(board: Board, kind: str) -> Finding:
     """Return the finding about `mcu.trailing_comma`, after the test of the last motor.
 
-    Some firmware turns or stops the last motor only if the line ends with a comma. `dead` says that
-    its movement was not seen.
+    Some firmware turns or stops the last motor only if the line ends with a comma. `kind` is that
+    of this motor.
     """
     if board.comma != board.mcu.trailing_comma:
         return _comma_wrong(board, "latched" if board.latched and board.comma else "disobeyed")
-    if dead:
+    if kind == "late":
+        return lateness.finding("trailing comma", board.lateness.since(0.0))
+    if kind == "dead":
         return outcomes.find("trailing comma: dead", last=board.letters[-1])
     how = "sent" if board.comma else "not sent"
     return outcomes.find(f"trailing comma: {how}", {"mcu.trailing_comma": board.comma})

@@ -12,6 +12,7 @@ from collections.abc import Iterable
 from acsard.checkup import motion, outcomes
 from acsard.checkup.findings import Finding
 from acsard.checkup.outcomes import TimingFinding
+from acsard.core.tables.finding_table import code_of
 
 # Shortest delay of this computer that `HostDelays` records. Shorter delays are normal.
 MIN_DELAY_S = 0.005
@@ -62,7 +63,7 @@ def finding(name: str, late_s: float) -> Finding:
 
 def judged(result: Finding) -> bool:
     """Return False if the finding says that the step was not judged, otherwise True."""
-    return result.figure != outcomes.OUTCOMES_BY_NAME[NOT_JUDGED].figure
+    return result.code != code_of(NOT_JUDGED)
 
 
 def unjudged(findings: Iterable[Finding]) -> list[str]:

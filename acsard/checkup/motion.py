@@ -23,9 +23,11 @@ MIN_WATCHDOG_S = 0.1
 MAX_WATCHDOG_S = 0.5
 
 # Speeds, rad/s
-SPEED = 3.0  # the highest speed that the check commands: half a turn per second
+SPEED = 3.0  # the speed of all steps but `top_speed`: half a turn per second
 RUNAWAY_SPEED = 2 * SPEED  # a faster motor ends the check
 MOVING_SPEED = SPEED / 4  # a motor at this speed or above counts as moving
+# Slower motors show no watchdog: 0.9 rad/s gave 0 ms for 300 ms.
+TURNING_SPEED = SPEED / 3
 STANDING_SPEED = SPEED / 10  # a motor below this speed counts as standing still
 # A motor that reaches this mean speed in a short probe (`wheels.probe`) counts as moving. The limit
 # is low, because a heavy wheel has hardly begun to turn by then.
@@ -168,22 +170,22 @@ def trend(replies: Sequence[BoardReply], zero: Motors, now_s: float, gap_s: floa
     return tuple(abs(b / a) if min(abs(a), abs(b)) > 0.1 else 1.0 for a, b in pairs)
 
 
-def grain_s(steady: Sequence[BoardReply], motors: Sequence[int]) -> float:
+def grain_s(steady: Sequence[BoardReply], motors: Sequence[int], speed: float = SPEED) -> float:
     """Return the resolution of the reported speeds as a time, s; 0 for fewer than five replies.
 
     Speeds jump because the firmware computes them from whole counts. It is the time in which a
-    motor at `SPEED` turns by a jump times the time between two replies.
+    motor at `speed` turns by a jump times the time between two replies.
     """
     if len(steady) < 5:
         return 0.0
     between_s = (steady[-1].at_s - steady[0].at_s) / (len(steady) - 1)
     speeds = [sorted(reply.motors[motor] for reply in steady) for motor in motors]
     # Leave out the largest and the smallest speed, because a damaged reply may contain either.
-    return max(course[-2] - course[1] for course in speeds) * between_s / SPEED
+    return max(course[-2] - course[1] for course in speeds) * between_s / speed
 
 
-def runaway(replies: Sequence[BoardReply]) -> tuple[int, float] | None:
-    """Return the number and speed of a motor that is faster than `RUNAWAY_SPEED`, or None.
+def runaway(replies: Sequence[BoardReply], most: float = RUNAWAY_SPEED) -> tuple[int, float] | None:
+    """Return the number and speed of a motor that is faster than `most` rad/s, or None.
 
     It takes several replies, because one may be damaged, or show one count of a coarse encoder.
     """
@@ -202,6 +204,6 @@ def runaway(replies: Sequence[BoardReply]) -> tuple[int, float] | None:
             # time would look like a high speed.
             seconds = max(SHORT_MEASUREMENT_S / 2, sum(seconds for seconds, _ in sure))
             speed = sum(seconds * speed for seconds, speed in sure) / seconds
-            if abs(speed) > RUNAWAY_SPEED:
+            if abs(speed) > most:
                 return motor, speed
     return None

@@ -14,7 +14,7 @@ from msgspec import Struct, structs
 
 from acsard.checkup import motion, outcomes
 from acsard.checkup.board import Board, Operator
-from acsard.checkup.findings import Finding, motor_name, wheel_of, with_spaces
+from acsard.checkup.findings import Finding, motor_name, motor_names, wheel_of, with_spaces
 from acsard.checkup.motion import (
     PROBE_MOVING_SPEED,
     SHORT_MEASUREMENT_S,
@@ -99,13 +99,12 @@ class Channel(Struct, frozen=True):
         return "off" if self.error > WARN_TOLERANCE + self.unsure else "right"
 
     @property
-    def follows(self) -> bool:
-        """Whether the own encoder moved as commanded in both directions, alone or not.
+    def turns(self) -> bool:
+        """Whether the own encoder moved forward as commanded, if slowly, alone or not.
 
-        Coupled with another one, it turns half as fast; a slower motor shows no watchdog.
+        The firmware then controls the motor, so that it is safe to turn it again.
         """
-        own, least = self.motor, 0.45 * SPEED
-        return self.judged and self.forth[own] >= least and self.back[own] <= -least
+        return not self.probed and self.forth[self.motor] >= motion.TURNING_SPEED
 
     @property
     def error(self) -> float:
@@ -174,25 +173,32 @@ def stands(channel: Channel) -> bool:
 def wheel_map(mcu: McuConfig, channels: Sequence[Channel]) -> Finding:
     """Return the finding that compares `[mcu.wheels]` with the wheels that the operator saw turn.
 
-    It suggests the configured entry if a motor does not work, or if its wheel was not seen.
+    It suggests the configured entry of a motor that does not work, or whose wheel was not seen.
     """
-    if any(channel.wheel is None for channel in channels):
+    unseen = [channel.motor for channel in channels if channel.wheel is None]
+    if len(unseen) == len(channels):
         return outcomes.find("wheel map: not seen")
     entries: dict[str, str] = {}
+    faulty: list[str] = []
     for channel in channels:
-        wheel, sign = wheel_of(mcu, channel.motor)
-        if channel.kind in FOLLOWING_KINDS and channel.wheel:
+        letter, (wheel, sign) = mcu.wheels.letters[channel.motor], wheel_of(mcu, channel.motor)
+        if channel.wheel and channel.kind in (*FOLLOWING_KINDS, "late"):
             wheel, sign = channel.wheel, 1 if channel.forward else -1
+        elif channel.wheel and channel.wheel != wheel:
+            faulty.append(f"motor {letter} turn the {with_spaces(channel.wheel)} wheel")
         if wheel in entries:
             return outcomes.find("wheel map: twice", wheel=with_spaces(wheel))
-        entries[wheel] = f"{'+' if sign > 0 else '-'}{mcu.wheels.letters[channel.motor]}"
+        entries[wheel] = f"{'+' if sign > 0 else '-'}{letter}"
     names = WHEEL_ANSWERS[len(channels)].values()
     wrong = [wheel for wheel in names if entries[wheel] != getattr(mcu.wheels, wheel)]
+    outcome = "other" if wrong else "faulty" if faulty else "partly" if unseen else "right"
     return outcomes.find(
-        "wheel map: other" if wrong else "wheel map: right",
-        {f"mcu.wheels.{wheel}": entries[wheel] for wheel in names},
+        f"wheel map: {outcome}",
+        {} if faulty else {f"mcu.wheels.{wheel}": entries[wheel] for wheel in names},
         map=" ".join(entries[wheel] for wheel in names),
         wheels=", ".join(map(with_spaces, wrong)),
+        answers=", ".join(faulty),
+        motors=motor_names(mcu, unseen),
     )
 
 

@@ -2,16 +2,11 @@
 
 from __future__ import annotations
 
-import re
-
-from msgspec import Struct, convert
+from msgspec import convert
 
 from acsard.checkup.findings import Finding, Verdict
+from acsard.core.tables.finding_table import code_of, table
 
-# Each entry has this form:
-# VERDICT step: outcome | figure
-#     the meaning
-#     -> the remedy
 # A "?" after the verdict marks an outcome that this computer can cause by running the check too
 # late, even if the board works correctly.
 OUTCOMES = """
@@ -19,55 +14,6 @@ PASS baud rate: right | {rate} baud
 FAIL baud rate: other | {rate}, not {configured} baud
     {heard} at the configured {configured} baud; good lines at {rate}
     -> write mcu.baud_rate = {rate}; the check goes on with it
-FAIL baud rate: received_nothing | nothing received
-    {heard} at {configured} baud, and no good line at any other rate
-    -> is this the right port (`acsard ports`), does the board have power, does its firmware answer
-    `{example}` (the letters are those of mcu.wheels), are TX and RX swapped?
-FAIL baud rate: received_text | text instead of replies
-    at {configured} baud {heard}; no good line at any other rate
-    -> the baud rate is right. Is this the board (`acsard ports`)? Then its firmware prints other
-    text: remove its Serial.print, and let it answer each line
-FAIL baud rate: received_form | replies in another form
-    at {configured} baud {heard}; no good line at any other rate
-    -> the lines are whole, but the firmware must send `{example}`: p or n as the sign, and two
-    digits, a point and two digits in each figure, without spaces
-FAIL baud rate: received_letters | other motors
-    at {configured} baud {heard}; no good line at any other rate
-    -> the lines are whole, but do not name each motor of mcu.wheels once: {wheels}; the check then
-    finds out which motor turns which wheel
-FAIL baud rate: received_cut | pieces of lines
-    at {configured} baud {heard}; no good line at any other rate
-    -> the firmware cuts its replies short or omits the line end: it must send all values and
-    Serial.println() in one reply; is its send buffer too small, or does it restart while it writes?
-FAIL baud rate: received_foreign | other bytes in the lines
-    at {configured} baud {heard}; no good line at any other rate
-    -> the baud rate is right, but other bytes are on the line: a debug print of the firmware, or
-    writes of a second program to this port. If it is neither, it is noise: use one ground for board
-    and computer, and a short cable away from the motors' leads
-FAIL baud rate: received_garbage | only garbage
-    at {configured} baud {heard}; no good line at any other rate
-    -> does the firmware send at 9600 to 500000 baud, at TTL level and not RS-232? is this the right
-    port (`acsard ports`), and is the board's ground connected to the computer's?
-FAIL baud rate: received_brownout | the board starts again and again
-    at {configured} baud {heard}: its supply voltage is too low
-    -> give the board a supply of its own or a thicker cable: starting motors pull down the voltage
-FAIL baud rate: received_boot | the board starts again and again
-    at {configured} baud {heard}
-    -> does its supply break down, or does an error in its firmware restart it?
-FAIL baud rate: received_nmea | another device
-    at {configured} baud {heard}: this is what a GPS receiver sends
-    -> name the port of the board: `acsard ports` lists all
-FAIL baud rate: received_few | few good lines
-    at {configured} baud {heard}; fewer good lines at any other rate
-    -> use a short cable away from the motors' leads, a common ground, or a lower baud rate at both
-    ends
-FAIL baud rate: received_statuses | only status lines
-    at {configured} baud {heard}; no good line at any other rate
-    -> the board hears nothing: connect this computer's TX to the board's RX
-FAIL baud rate: received_sparse | good lines, but too seldom
-    at {configured} baud {heard}; no good line at any other rate
-    -> the board must answer each line, or report by its own clock at least every 0.25 s; does
-    delay() or a slow print block its loop?
 
 PASS identification: named | {short}
     {text}
@@ -112,6 +58,12 @@ FAIL? reply rate: rare | {rate:.1f} Hz, {way}
 FAIL? reply rate: none | too few replies
     the board leaves lines unanswered
     -> the firmware must answer every line, or report by its own clock
+
+PASS reply times: even | p50 {usual:.0f} ms, p99 {high:.0f} ms, max {longest:.0f} ms apart
+WARN? reply times: bunched | p50 {usual:.0f} ms, p99 {high:.0f} ms, max {longest:.0f} ms apart
+    {share:.0%} of the replies come in bunches behind silences: something blocks the firmware's
+    loop, so commands wait as long, and the pose is less certain
+    -> which library, delay() or print in the loop takes {longest:.0f} ms? Let the loop never wait
 
 PASS round trip: right | p50 {middle:.1f} ms, max {longest:.1f} ms
 WARN? round trip: slow | p50 {middle:.1f} ms, max {longest:.1f} ms
@@ -241,6 +193,13 @@ WARN measured speeds: set points | none
     -> watch each wheel while its motor turns
 SKIPPED wheel map: not seen
     no person watched: the check assumes the configured wheel and direction of each motor
+WARN wheel map: partly
+    nobody said which wheel these turn: {motors}; the others turn the configured wheels
+    -> check again, and watch all wheels
+WARN wheel map: faulty
+    you saw {answers}, which differs from the configuration, but these motors have faults (see
+    above)
+    -> fix the motors above, and check again
 PASS wheel map: right | {map}
 FAIL wheel map: other | {map}
     this differs from the configuration: {wheels}
@@ -256,7 +215,24 @@ WARN? least speed: large | {least:g} rad/s
     -> let the firmware control the speed of the motors (the sketch does), or raise the least speed
     of the planner above this
 SKIPPED least speed: untested
-    no motor followed its commands
+    no motor turned forward as commanded
+    -> fix the motors above, and check again
+PASS top speed: reached | {top:.1f} rad/s
+WARN? top speed: short | {most:.1f} of {speed:.1f} rad/s
+    the limits allow {top:.1f} rad/s, which is {way:.2f} m/s at the wheel, but this motor or these
+    stay behind, with the wheels in the air: {motors}. The daemon then says that the wheel is slow
+    -> write a lower limits.linear_speed or limits.angular_speed, or check the supply of the motors
+FAIL top speed: overflow | {most:.1f} at {speed:.1f} rad/s
+    up to {below:.1f} rad/s the board reports the right direction; on the way to {speed:.1f} rad/s
+    this motor or these are reported backward: {motors}. A number in the firmware overflows, and the
+    daemon would take that for a wheel that turns the wrong way
+    -> compute and send speeds in a wider type (float, or 32 bits); until then write limits below
+    {below:.1f} rad/s
+SKIPPED top speed: no watchdog
+    the watchdog of the board is not known to work, so the check does not turn the motors fast
+    -> fix the watchdog above, and check again
+SKIPPED top speed: untested
+    no motor turned forward as commanded
     -> fix the motors above, and check again
 SKIPPED encoder counts: none
     the firmware sends no counts
@@ -290,7 +266,8 @@ FAIL encoder counts: wrong | {counts}, not {configured}
     -> write mcu.encoder_counts = {counts}
 
 SKIPPED watchdog: untested
-    no motor followed its commands, so none can show whether the watchdog works
+    no encoder showed a motor that turns forward when commanded, so none can show whether the
+    watchdog works
     -> fix the motors above, and check again
 FAIL? watchdog: weak
     motors {letters} turned one by one, but not together: is the supply too weak?
@@ -318,7 +295,7 @@ PASS? watchdog: right | {figure}
     300 ms is right
 
 SKIPPED damaged lines: untested
-    no motor followed its commands, so none can show whether the board obeys damaged lines
+    no motor turned forward as commanded, so none can show whether the board obeys damaged lines
     -> fix the motors above, and check again
 PASS? damaged lines: right | {lines} lines, no motor moved
 WARN damaged lines: lenient | {took} of {kinds} kinds obeyed
@@ -394,10 +371,10 @@ FAIL restarts: gone | {times}
     the board restarted {told}, and did not answer again within {patience:g} s
     -> switch it off and on; does its bootloader hang after a reset by the watchdog, or does its
     supply fail?
-FAIL? link: silent | silent for {seconds:.1f} s
+FAIL? link: stops | silent for {seconds:.1f} s
     the microcontroller stopped replying while it had to turn {motors}
     -> does its supply dip when a motor starts, so that it restarts? is a cable loose?
-FAIL? link: silent at zeros | silent for {seconds:.1f} s
+FAIL? link: stops at zeros | silent for {seconds:.1f} s
     the microcontroller stopped replying while this computer sent it only zeros
     -> is a cable or plug loose? did its supply fail, or does its firmware hang?
 WARN late: not judged | not judged
@@ -420,49 +397,23 @@ class TimingFinding(Finding, frozen=True):
     margin_s: float = 0.0
 
 
-class Outcome(Struct, frozen=True):
-    """One possible outcome of a step, with the format strings of its finding.
-
-    `unsure` says whether a computer that runs the check too late can cause this outcome.
-    """
-
-    verdict: Verdict
-    unsure: bool
-    figure: str
-    text: str
-    mend: str
-
-
-def _parse_manual(manual: str) -> dict[str, Outcome]:
-    outcomes = {}
-    for entry in re.split(r"\n+(?! )", manual.strip()):
-        head, *rest = entry.splitlines()
-        verdict, _, head = head.partition(" ")
-        outcome, _, figure = head.partition(" | ")
-        text, _, mend = " ".join(line.strip() for line in rest).partition("-> ")
-        parts = {"verdict": verdict.rstrip("?"), "unsure": verdict.endswith("?"), "figure": figure}
-        outcomes[outcome] = convert(parts | {"text": text.strip(), "mend": mend}, Outcome)
-    return outcomes
-
-
-# Maps the name of each outcome, such as "baud rate: right", to the outcome.
-OUTCOMES_BY_NAME = _parse_manual(OUTCOMES)
+OUTCOMES_BY_CODE = table(None, OUTCOMES)
 
 
 def find(outcome: str, keys: dict[str, object] | None = None, **values: object) -> Finding:
-    """Return the finding for an outcome, a key of `OUTCOMES_BY_NAME`, with the values in its texts.
+    """Return the finding for an outcome such as "baud rate: right", with the values in its texts.
 
     The value `name` replaces the name of the finding, and `margin_s` is stored if the outcome is
     unsure.
     """
-    entry = OUTCOMES_BY_NAME[outcome]
-    name = str(values.get("name", outcome.partition(":")[0]))
-    figure, text, mend = (s.format(**values) for s in (entry.figure, entry.text, entry.mend))
-    code = re.sub(r"\W+", "_", outcome.partition(": ")[2])
+    code = code_of(outcome)
+    entry = OUTCOMES_BY_CODE[code]
+    name, verdict = str(values.get("name", entry.subject)), convert(entry.mark, Verdict)
+    figure, text, mend = (s.format(**values) for s in (entry.figure, entry.text, entry.advice))
     if not entry.unsure:
-        return Finding(name, entry.verdict, figure, text, mend, keys or {}, code)
+        return Finding(name, verdict, figure, text, mend, keys or {}, code)
     margin_s = float(str(values.get("margin_s", 0.0)))
-    return TimingFinding(name, entry.verdict, figure, text, mend, keys or {}, code, margin_s)
+    return TimingFinding(name, verdict, figure, text, mend, keys or {}, code, margin_s)
 
 
 def plain(finding: Finding) -> Finding:

@@ -21,7 +21,9 @@ from acsard.checkup import (
     least_speed,
     line_loss,
     outcomes,
+    reply_times,
     restarts,
+    top_speed,
     watchdog,
 )
 from acsard.checkup.board import Board, Operator, Wire
@@ -37,6 +39,7 @@ from acsard.checkup.motor_channels import (
 )
 from acsard.checkup.outcomes import TimingFinding
 from acsard.checkup.restarts import Restart, RestartedError
+from acsard.core.config.motion_rules import top_wheel_speed
 from acsard.core.config.settings import Config, SafetyConfig
 from acsard.core.formatting import many
 from acsard.core.link.link_state import WATCHDOG_S
@@ -45,7 +48,8 @@ from acsard.core.values import NS_PER_S
 LIFTED, QUITS = "lifted", "q"
 
 CONFIRMATION = (
-    "The wheels will turn one by one, then together. The tool commands 3 rad/s at most, but a "
+    "The wheels will turn one by one, then together. The tool commands 3 rad/s at most, and "
+    "at the end {top:.0f} rad/s for some seconds, the highest speed of your limits; but a "
     "wheel whose encoder is dead or reversed can reach full speed for about a second. Lift the "
     "robot so that no wheel touches anything, keep a hand on the power switch, then type "
     f'"{LIFTED}". No wheel has turned yet; q or Ctrl-C quits at any time:'
@@ -55,8 +59,8 @@ CONFIRMATION = (
 # without one.
 STEPS = (
     "baud rate", "identification", "reply form", "reply rate", "round trip", "checked link",
-    "lost lines", "motors", "trailing comma", "wheel map", "encoder counts", "least speed",
-    "watchdog", "damaged lines", "inputs",
+    "lost lines", "reply times", "motors", "trailing comma", "wheel map", "encoder counts",
+    "least speed", "watchdog", "damaged lines", "top speed", "inputs",
 )  # fmt: skip
 
 # The first steps of the check, in order, each with a message for the operator.
@@ -70,6 +74,7 @@ SILENT_STEPS: tuple[tuple[str, Callable[[Board], Finding | None]], ...] = (
     ("checking the format of the replies", dialect.replies),
     ("asking whether the board supports the link check", dialect.check),
     ("counting lost lines for 3 s or more", line_loss.finding),
+    ("measuring when the replies arrive", reply_times.finding),
 )
 
 Step = Callable[[], Finding | None]
@@ -121,12 +126,13 @@ def run(
     try:
         with Board(wire, config.mcu, config.rate_hz, config.feedback.encoders) as board:
             board.zeros()
-            if operator.ask(CONFIRMATION, (LIFTED,)) != LIFTED:
+            top = top_wheel_speed(config)
+            if operator.ask(CONFIRMATION.format(top=max(3, top)), (LIFTED,)) != LIFTED:
                 raise StoppedError(outcomes.find("wheels: not lifted"))
             watched = _Watched(operator, board, asleep_ns)
             board.abort_check = watched.check_operator
             radius = config.drive.wheel_radius
-            _Steps(board, watched, once, all_restarts, radius).all(config.safety)
+            _Steps(board, watched, once, all_restarts, radius, top).all(config.safety)
     except StoppedError as end:
         once(end.finding)
         why = f"the check ended early: {end.finding.name}"
@@ -181,9 +187,10 @@ class _Steps:
         tell: Callable[[Finding | None], None],
         seen: list[Restart],
         radius: float,
+        top: float,
     ) -> None:
         self._board, self._operator, self._tell = board, operator, tell
-        self._radius = radius
+        self._radius, self._top = radius, top
         # All restarts of the board so far. The caller of `all` reads this list afterward.
         self._all_restarts = seen
         self._channels: list[Channel] = []
@@ -196,20 +203,26 @@ class _Steps:
         self._take("", self._stop_and_arm)
         self._turn_motors()
         channels = self._channels
-        self._take("", lambda: dialect.comma(board, channels[-1].kind in ("dead", "late")))
+        self._take("", lambda: dialect.comma(board, channels[-1].kind))
         self._take("", board.repeats.finding)
         self._take("", lambda: wheel_map(board.mcu, channels))
         right = [channel.motor for channel in channels if channel.kind in ("right", "off")]
         self._take("", lambda: encoder_counts.finding(board, right))
-        # If no motor is right, motors that are coupled or too slow show the watchdog too.
-        turned = right or [channel.motor for channel in channels if channel.follows]
+        # If no motor is right, those that turn at all show the watchdog too.
+        turned = right or [channel.motor for channel in channels if channel.turns]
         if board.repeats.encoders:
             rising = "the motors turn slowly, then faster"
             self._measure(rising, lambda: least_speed.finding(board, turned, self._radius))
         together = "the motors turn, then this computer sends nothing, perhaps several times"
-        self._measure(together, lambda: watchdog.finding(board, turned))
+        stops = self._measure(together, lambda: watchdog.finding(board, turned))
         broken = "sending damaged lines; a motor that turns now is a fault"
         self._measure(broken, lambda: damage.finding(board, turned))
+        if board.repeats.encoders:
+            rising = f"the motors turn up to {self._top:.1f} rad/s"
+            safe = stops is not None and stops.verdict in ("PASS", "WARN")
+            self._measure(
+                rising, lambda: top_speed.finding(board, turned, safe, self._top, self._radius)
+            )
         self._take("", lambda: inputs.finding(board, operator, safety))
 
     def _stop_and_arm(self) -> None:
@@ -240,14 +253,15 @@ class _Steps:
             return encoder_finding(board.mcu, channels[motor])
 
         finding = self._in_time(measure_motor)
-        if finding is not None and not lateness.judged(finding):
+        late = finding if finding is not None and not lateness.judged(finding) else None
+        if late:
             channels[motor] = structs.replace(channels[motor], judged=False)
-            return finding
+        # A person sees which wheel turns, even if this computer was late.
         channels[motor] = ask_which_wheel(board, operator, channels[motor])
-        return encoder_finding(board.mcu, channels[motor])
+        return late or encoder_finding(board.mcu, channels[motor])
 
-    def _measure(self, doing: str, step: Step) -> None:
-        self._take(doing, partial(self._in_time, step))
+    def _measure(self, doing: str, step: Step) -> Finding | None:
+        return self._take(doing, partial(self._in_time, step))
 
     def _in_time(self, step: Step) -> Finding | None:
         board, saved, late_s = self._board, self._board.saved_results, 0.0
@@ -286,7 +300,7 @@ class _Steps:
 
     def _take(
         self, doing: str, step: Step, tell: Callable[[Finding | None], None] | None = None
-    ) -> None:
+    ) -> Finding | None:
         board, again = self._board, 0
         saved = board.saved_results
         while True:
@@ -295,8 +309,9 @@ class _Steps:
                     self._come_back()
                 if doing:
                     self._operator.doing(doing)
-                (tell or self._tell)(self._tried(step))
-                return
+                finding = self._tried(step)
+                (tell or self._tell)(finding)
+                return finding
             except RestartedError as error:
                 self._all_restarts.append(error.restart)
                 again += 1

@@ -25,7 +25,7 @@ from acsard.core.values import Seconds
 # Kinds of damaged lines that must not feed the watchdog. The check sends lines of these kinds.
 DAMAGE_KINDS = ("a wrong letter", "neither p nor n", "cut short")
 
-# Of the commanded speed: from `TURNING` on a motor has not slowed down, below `STOPPED` it stands.
+# Of the speed before: from `TURNING` on a motor has not slowed down, below `STOPPED` it stands.
 TURNING, STOPPED = 0.9, 0.1
 
 # Upper bound of the watchdog's delay if the motors did not stop even in the longest silence.
@@ -42,7 +42,7 @@ class Run(Struct, frozen=True):
     silent_s: Seconds
     # How far the motors ran on before they stood still, as a time.
     ran_s: Seconds
-    # From the last line that turned the motors (of an ordinary stop: from the zeros) to `STOPPED`.
+    # From the last line that turned the motors (of an ordinary stop: from the zeros) to rest.
     slow_s: Seconds
     # Speed in the first reply after the silence, of the commanded one: the momentary one, or the
     # mean of the silence if the firmware computes it from the movement since the previous line.
@@ -58,7 +58,7 @@ def finding(board: Board, motors: Sequence[int]) -> Finding:
     """Measure the delay of the watchdog with `motors`, and return the finding.
 
     Unless it is FAIL, also test damaged lines. At the end, all motors stand still. Raises
-    `StoppedError` if no motor reaches half of the commanded speed.
+    `StoppedError` if no motor turns.
     """
     if not motors:
         return outcomes.find("watchdog: untested")
@@ -146,17 +146,20 @@ def _bisect_timeout(board: Board, motors: Sequence[int], stop: Run, bounds: Boun
 def run(board: Board, motors: Sequence[int], length_s: float, instead: Iterable[bytes] = ()) -> Run:
     """Bring the motors to speed, send no valid line for `length_s` s, and stop them.
 
-    The damaged lines in `instead` are sent meanwhile. Raises `StoppedError` if no motor reaches
-    half of the commanded speed.
+    The damaged lines in `instead` are sent meanwhile. Raises `StoppedError` if no motor
+    turns.
     """
     began_s = board.now_s
     full = run_up(board, board.only(motors))
-    if max(abs(full[motor]) for motor in motors) < motion.SPEED / 2:
+    reached = max(abs(full[motor]) for motor in motors)
+    if reached < motion.TURNING_SPEED:
         board.stop_motors()
         letters = ", ".join(board.letters[motor] for motor in motors)
         raise StoppedError(outcomes.find("watchdog: weak", letters=letters))
     # The ramp is over in the second half of the time since `began_s`.
-    grain_s = motion.grain_s(motion.since(board.replies, (began_s + board.now_s) / 2), motors)
+    grain_s = motion.grain_s(
+        motion.since(board.replies, (began_s + board.now_s) / 2), motors, reached
+    )
     told_s, lines = board.sent_s, iter(instead)
     while (left_s := told_s + length_s - board.now_s) > 0:
         if line := next(lines, b""):
@@ -166,10 +169,11 @@ def run(board: Board, motors: Sequence[int], length_s: float, instead: Iterable[
     board.send_zero()
     told_s = told_s if length_s else board.sent_s
     board.stop_motors()
-    first, second = (_share(reply, motors) for reply in board.replies[before : before + 2])
+    first, second = (_share(reply, motors, reached) for reply in board.replies[before : before + 2])
     course = motion.since(board.replies, told_s)
     slow_s = next(
-        (r.at_s - told_s for r in course if _share(r, motors) < STOPPED), motion.SLOWING_TIMEOUT_S
+        (r.at_s - told_s for r in course if _share(r, motors, motion.STANDING_SPEED) < 1.0),
+        motion.SLOWING_TIMEOUT_S,
     )
     # If the board replies to lines, its reply to the last line contains the speeds at the moment at
     # which this line took effect. The motors run on from that moment.
@@ -178,7 +182,7 @@ def run(board: Board, motors: Sequence[int], length_s: float, instead: Iterable[
     )
     since_s = course[0].at_s if answered else told_s
     ran = motion.covered(board.replies, board.zero, since_s, _per_turn(board, motors))
-    ran_s = max(abs(ran[m] / full[m]) for m in motors if abs(full[m]) >= motion.SPEED / 2)
+    ran_s = max(abs(ran[m] / full[m]) for m in motors if abs(full[m]) >= reached / 2)
     return Run(silent_s, ran_s, slow_s, first, second, grain_s)
 
 
@@ -190,5 +194,5 @@ def _per_turn(board: Board, motors: Sequence[int]) -> float:
     return 0.0 if wraps or per_turn < 1 else per_turn
 
 
-def _share(reply: BoardReply, motors: Sequence[int]) -> float:
-    return max(abs(reply.motors[motor]) for motor in motors) / motion.SPEED
+def _share(reply: BoardReply, motors: Sequence[int], reached: float) -> float:
+    return max(abs(reply.motors[motor]) for motor in motors) / reached

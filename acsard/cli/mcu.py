@@ -35,13 +35,14 @@ port itself. If a daemon on this computer has the port open, and its robot rests
 switches the robot off and lends the port until the check ends; it must answer at the address in
 the configuration, and this user must be an operator or more. Otherwise the exit code is 75. The
 tool asks you to type that the wheels are lifted. Then it turns the motors one by one, and then all
-together. It commands at most 3 rad/s, but a wheel whose encoder is dead or reversed can reach full
-speed. If the board restarts during a test, the tool reports that and repeats the test. The check
-ends if the tool itself could not run for more than 3 s (5 s before the first motor test), for
-example because the computer was suspended. The tool always ends by sending zero speeds to the
-board, and sends nothing more after them. The exit code is 0 if every test was judged and none
-failed. It is 1 if a test failed, if the tool ended early, or if this computer was too slow to judge
-a test; in that case try again when the computer is idle.
+together. It commands at most 3 rad/s, and near the end, if the watchdog works, the highest speed of
+the configured limits. A wheel whose encoder is dead or reversed can reach full speed. If the board
+restarts during a test, the tool reports that and repeats the test. The check ends if the tool
+itself could not run for more than 3 s (5 s before the first motor test), for example because the
+computer was suspended. The tool always ends by sending zero speeds to the board, and sends nothing
+more after them. The exit code is 0 if every test was judged and none failed. It is 1 if a test
+failed, if the tool ended early, or if this computer was too slow to judge a test; in that case try
+again when the computer is idle.
 """
 
 

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from typing import Literal
 
-from acsard.core.codes import PoseCode
 from acsard.core.link.board_status import as_text
 from acsard.core.messages.schema import BatterySummary, Cause, RobotState, SourceState, Time
 from acsard.core.messages.snapshot import Snapshot
 from acsard.core.motion.arbiter_text import waiting
 from acsard.core.robot import Robot
+from acsard.core.tables.pose_codes import PoseCode
 from acsard.core.values import NS_PER_S, BatteryStatus, GyroStatus, Ns
 from acsard.core.values import Cause as LatchedCause
 
@@ -44,7 +44,14 @@ def summary(robot: Robot, now_ns: Ns) -> Snapshot:
             source=status.source,
             sources=[
                 SourceState(
-                    s.name, s.priority, s.age_s, waiting(s.waits_for).text, s.waits_for.what
+                    s.name,
+                    s.priority,
+                    s.age_s,
+                    waiting(s.waits_for).text,
+                    s.waits_for.what,
+                    s.twist.linear if s.twist else None,
+                    s.twist.angular if s.twist else None,
+                    s.longest_gap_s,
                 )
                 for s in sources
             ],

@@ -11,13 +11,10 @@ from typing import TYPE_CHECKING, Annotated, Literal, get_args
 
 from msgspec import Meta, Struct
 
-from acsard.core.codes import (
-    Code,
-    GuardCode,
-    ObjectionCode,
-    RefusalCode,
-    WaitCode,
-)
+from acsard.core.codes import Code, RefusalCode
+from acsard.core.tables.message_codes import ObjectionCode
+from acsard.core.tables.motor_codes import GuardCode
+from acsard.core.tables.sender_codes import WaitCode
 
 # The order of every value with one item per wheel. If only two wheels are driven, their values are
 # the first two, and those of the rear wheels are equal to them.
@@ -327,13 +324,15 @@ class SourceStatus(Struct, frozen=True):
     """The state of a command source.
 
     `age_s` is the time since its last accepted command, s, and None after an event that requires a
-    zero.
+    zero. `twist` is that of this command.
     """
 
     name: str
     priority: int
     age_s: float | None
     waits_for: Wait
+    twist: Twist | None = None
+    longest_gap_s: Seconds = 0.0  # between a speed and the next command, in the last minute
 
 
 class WheelsStatus(Struct, frozen=True):

@@ -413,7 +413,7 @@ def _with_known_codes(raw: Any) -> Any:
 def _with_known_code(raw: Any) -> Any:
     match raw:
         case {"code": str(code), "text": str(text)} if code not in CODES:
-            why = reason("other_version", part=_safe(code), cause=text, named=code)
+            why = reason("other_version", _safe(code), cause=text, named=code)
             return raw | {"code": why.code, "text": why.text, "part": why.part}
     return raw
 

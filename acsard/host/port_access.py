@@ -90,12 +90,6 @@ def _is_member(group: str) -> bool:
         return False
 
 
-WITHOUT_DEVICE = (
-    "is there, but no device is behind it: was it plugged in again? A container keeps the file of "
-    "the old one: pass /dev/serial/by-id into it, or restart it"
-)
-
-
 def is_orphan(path: str) -> bool:
     """Whether a character device has no device. Opening a port would restart an Arduino."""
     number = os.stat(path).st_rdev

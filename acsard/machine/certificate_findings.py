@@ -23,12 +23,12 @@ from acsard.bus.tls_files import (
 )
 from acsard.bus.zenoh_sessions import certificate_trouble
 from acsard.core.config.settings import Config
-from acsard.core.messages.certificate_expiry import CERTIFICATE_LEVELS, expiry, first_expiry
+from acsard.core.messages.certificate_expiry import expiry, first_expiry
 from acsard.host.clock import now
 from acsard.host.errors import MendableError
 from acsard.host.extras import install
 from acsard.machine.certificates import CA_KEY, ROBOT_NAME
-from acsard.machine.finding import LEVELS, Finding
+from acsard.machine.finding import Finding, about, finding
 
 
 def certificates(tls: str) -> Iterator[Finding]:
@@ -38,37 +38,35 @@ def certificates(tls: str) -> Iterator[Finding]:
     directory = Path(tls)
     for file in files_in(tls):
         if os.path.exists(file) and not os.path.isfile(file):  # reading it might never end
-            mend = _mend_of_absent(directory)
-            yield Finding("certificates", "failure", f"{file} is not a file", mend)
+            yield finding("certificates_not_a_file", file=file, advice=_mend_of_absent(directory))
             return
-    key = directory / KEY
+    key, own = directory / KEY, directory / CERTIFICATE
     if os.path.isfile(key) and key.stat().st_mode & 0o077:
-        text = f"users other than the owner can read the private key {key}"
-        yield Finding("certificates", "failure", text, f"chmod 600 {shlex.quote(str(key))}")
+        yield finding("certificates_open_key", key=key, quoted=shlex.quote(str(key)))
     try:
         require_usable(tls)
     except MendableError as error:
-        yield Finding("certificates", "failure", str(error), _mend_of_absent(directory))
+        yield finding("certificates_unusable", why=error, advice=_mend_of_absent(directory))
         return
     if why := certificate_trouble(*files_in(tls)):
-        text = f"Zenoh refuses {directory / CERTIFICATE} with the key {directory / KEY} ({why})"
-        yield Finding("certificates", "failure", text, renewal(tls, ""))
+        advice = renewal(tls, "")
+        yield finding("certificates_refused", certificate=own, key=key, why=why, advice=advice)
         return
     if not common_name(tls):  # which a connection shows that trusts only the authority
-        text = (
-            f"{directory / CA} has not signed {directory / CERTIFICATE}: clients that trust only "
-            "this authority refuse this machine"
+        yield finding(
+            "certificates_not_signed",
+            ca=directory / CA,
+            certificate=own,
+            names=f"{CA}, {CERTIFICATE} and {KEY}",
+            ca_key=CA_KEY,
         )
-        mend = f"copy {CA}, {CERTIFICATE} and {KEY} again from the machine that has {CA_KEY}"
-        yield Finding("certificates", "warning", text, mend)
         return
     expiries = expiry_times(tls)
-    code, words = expiry(expiries, now().wall_ns)
-    level = CERTIFICATE_LEVELS[code]
-    mend = renewal(tls, first_expiry(expiries)[0]) if expiries else install()
     if not expiries:
-        words = "nobody sees when they expire: the library that reads certificates is missing"
-    yield Finding("certificates", LEVELS[level], f"{tls}: {words}", mend if level else "")
+        yield finding("certificates_unreadable", tls=tls, advice=install())
+        return
+    mend = renewal(tls, first_expiry(expiries)[0])
+    yield about("certificates", expiry(expiries, now().wall_ns, mend, f"{tls}: "))
 
 
 def renewal(tls: str, whose: str) -> str:
@@ -135,6 +133,4 @@ def router_certificates(config: Config) -> Iterator[Finding]:
     """Yield a finding about the certificate of each TLS router in `bus.connect` that answers."""
     tls = config.bus.tls
     for whose, ends_ns in router_expiry_times(config.bus.tls_routers, tls).items():
-        code, words = expiry({whose: ends_ns}, now().wall_ns)
-        level = CERTIFICATE_LEVELS[code]
-        yield Finding("router", LEVELS[level], words, renewal(tls, whose) if level else "")
+        yield about("router", expiry({whose: ends_ns}, now().wall_ns, renewal(tls, whose)))

@@ -26,15 +26,15 @@ from acsard.core.config.live import differences
 from acsard.core.config.parsing import ConfigError, from_builtins, parse
 from acsard.core.config.settings import SIMULATOR, Config, is_tls
 from acsard.core.formatting import listed
-from acsard.core.messages.diagnostics import OK
 from acsard.core.messages.schema import DiagnosticStatus, Info
+from acsard.core.tables.finding_table import LEVELS
 from acsard.core.values import NS_PER_S, AcsardError, Seconds
 from acsard.host import clock
 from acsard.host.errors import MendableError, NoAnswerError
 from acsard.host.own_identity import own_addresses
 from acsard.host.processes import is_daemon_here
 from acsard.machine.certificate_findings import certificates, router_certificates
-from acsard.machine.finding import LEVELS, Finding
+from acsard.machine.finding import Finding, about, finding
 from acsard.machine.local_findings import computer, serial_port
 
 MAX_KEYS = 6  # in one finding of `compared`
@@ -47,10 +47,6 @@ OPTION_KEYS = (
 
 # Zenoh replaces time stamps from 0.5 s on.
 MAX_APART_S = 0.4
-
-OTHER_VERSION_ADVICE = (
-    "if the daemon has another version of acsard, run this tool from the same version"
-)
 
 
 class Running(Struct, frozen=True):
@@ -65,12 +61,6 @@ class Running(Struct, frozen=True):
     round_trip_s: Seconds = 0.0  # of the query of its clock
 
 
-NOT_READ = (
-    "this role may not read the daemon's configuration, and the file is of another robot: the "
-    "daemon's port and files were not examined"
-)
-
-
 def examine(
     where: str,
     text: bytes,
@@ -83,9 +73,9 @@ def examine(
     endpoint is a usage error.
     """
     told = {""}
-    for finding in _findings(where, text, overrides, find_address):
-        yield replace(finding, mend="") if finding.mend in told else finding
-        told.add(finding.mend)
+    for found in _findings(where, text, overrides, find_address):
+        yield replace(found, mend="") if found.mend in told else found
+        told.add(found.mend)
 
 
 def _findings(
@@ -98,27 +88,26 @@ def _findings(
         config = parse(text, overrides)
     except ConfigError as error:
         for problem in error.problems:
-            yield Finding("configuration", "failure", f"{where}: {problem}", "see acsard.toml")
+            yield finding("configuration_wrong", where=where, problem=problem)
         return
-    yield Finding("configuration", "ok", where)
+    yield finding("configuration_read", where=where)
     address = find_address(config)
     running = query_or_finding(config, address)
     if isinstance(running, Finding):
         yield running
         yield from local(config, address, config.bus.tls, None)
         return
-    yield Finding("daemon", "ok", f"acsard {running.info.version}, pid {running.info.pid}")
-    yield Finding("role", "ok", running.role)
+    yield finding("daemon_answers", version=running.info.version, pid=running.info.pid)
+    yield finding("role_known", role=running.role)
     yield from reported(running.rows)
     if running.is_local:
         if running.config is None:
-            yield Finding("configuration", "ok", NOT_READ)
+            yield finding("configuration_secret")
             return
         yield from compared(running.config, config)
         yield from local(running.config, address, config.bus.tls, running.info.pid)
     else:
-        text_ = "the daemon runs on another machine: check its port, files and TLS gateway there"
-        yield Finding("daemon", "ok", text_)
+        yield finding("daemon_elsewhere")
         yield from clocks(running)
         yield from certificates(address.tls)
 
@@ -130,10 +119,9 @@ def local(config: Config, address: Address, written: str, pid: int | None) -> It
     daemon copies of the certificates at its start, so all directories are examined.
     """
     for warning in warnings(config):
-        yield Finding("configuration", "warning", warning, "see acsard.toml")
+        yield finding("configuration_doubtful", warning=warning)
     if not (config.odometry.calibrated or config.mcu.simulated):
-        why = reason("not_calibrated")
-        yield Finding("calibration", "warning", why.text.rstrip(":"), why.advice)
+        yield about("calibration", reason("not_calibrated"))
     yield from serial_port(config.mcu.port, config.mcu.simulated and pid is None)
     yield from computer(config.control.real_time, pid)
     for directory in dict.fromkeys((config.bus.tls, address.tls, written)):
@@ -148,11 +136,12 @@ def reported(rows: tuple[DiagnosticStatus, ...]) -> Iterator[Finding]:
     details = [{pair.key: pair.value for pair in row.values} for row in rows]
     codes = Counter(values.get("code") for values in details)
     for row, values in zip(rows, details, strict=True):
+        code, advice = values.get("code", ""), values.get("advice", "")
         # The row of the link has the reason for which the robot waits, too.
-        if row.level == OK and "code" in values and codes[values["code"]] > 1:
+        if row.level and codes[code] > 1 and not advice:
             continue
         subject, level = row.name.removeprefix("acsard: "), LEVELS[min(row.level, 2)]
-        yield Finding(subject, level, row.message, values.get("advice", ""))
+        yield Finding(subject, code, level, row.message, advice)
 
 
 def query_or_finding(config: Config, address: Address) -> Running | Finding:
@@ -160,35 +149,18 @@ def query_or_finding(config: Config, address: Address) -> Running | Finding:
     endpoint = address.endpoint
     if not answers(endpoint):
         if config.bus.mode == "client" and endpoint in map(reachable, config.bus.connect):
-            text = (
-                f"this tool reaches the daemon only through the Zenoh router at {endpoint}, and no "
-                "program listens there"
-            )
-            mend = (
-                "start that router (rmw_zenohd, zenohd or `acsard router`), then run `acsard "
-                "doctor` again; until then, `systemctl status acsard` shows the state of the daemon"
-            )
-            return Finding("daemon", "warning", text, mend)
-        mend = (
-            "if the daemon is a systemd service, `systemctl status acsard` shows why it does not "
-            "run; otherwise start it with `acsard run`. If the daemon was started with --listen "
-            "ADDRESS, give this command the same address with --connect"
-        )
-        mend = "; ".join(filter(None, (mend, address.advice)))
-        return Finding("daemon", "warning", f"no program listens at {endpoint}", mend)
+            return finding("daemon_behind_router", endpoint=endpoint)
+        advice = f"; {address.advice}" if address.advice else ""
+        return finding("daemon_absent", endpoint=endpoint, advice=advice)
     try:
         return query(config, address)
     except NoAnswerError as error:
-        mend = (
-            "if the daemon has another robot id, name that id with --id (`acsard fleet` lists the "
-            "robots); otherwise check whether another program listens at that address"
-        )
-        return Finding("daemon", "failure", str(error), mend)
+        return finding("daemon_silent", error=error)
     except MendableError as error:
         # The text of such an error contains the advice.
-        return Finding("daemon", "failure", str(error))
+        return finding("daemon_refuses", error=error)
     except AcsardError as error:
-        return Finding("daemon", "failure", str(error), OTHER_VERSION_ADVICE)
+        return finding("daemon_other_version", error=error)
 
 
 def query(config: Config, address: Address) -> Running:
@@ -224,25 +196,17 @@ def compared(running: Config, file: Config) -> Iterator[Finding]:
     """Yield a finding about the values of the daemon that differ from those of the file."""
     runs, ours = running.robot.id, file.robot.id
     if runs != ours:
-        text = f"the file is not compared with the daemon: it is for robot {ours}, not for {runs}"
-        yield Finding("configuration", "ok", text)
+        yield finding("configuration_other_robot", ours=ours, runs=runs)
         return
     others = differences(running, file)
     if not others:
-        yield Finding("configuration", "ok", "the running daemon uses the file's values")
+        yield finding("configuration_same")
         return
     texts = [difference.describe(key) for key, difference in others.items()]
-    text = f"the running daemon has other values than the file: {listed(texts, MAX_KEYS, '; ')}"
-    if others.keys() <= set(OPTION_KEYS):
-        yield Finding("configuration", "ok", f"{text}; they come from its options")
-        return
-    yield Finding(
-        "configuration",
-        "warning",
-        text,
-        "they come from options of `acsard run`, from `acsard set`, from another file (name it "
-        "with --config), or the file has changed since the daemon's start: restart the daemon with "
-        "this file, or write the values into it",
+    by_options = others.keys() <= set(OPTION_KEYS)
+    yield finding(
+        "configuration_options" if by_options else "configuration_differs",
+        values=listed(texts, MAX_KEYS, "; "),
     )
 
 
@@ -251,14 +215,7 @@ def clocks(running: Running) -> Iterator[Finding]:
     # The daemon has read its clock at an unknown moment between the query and the answer.
     if abs(running.ahead_s) > MAX_APART_S + running.round_trip_s / 2:
         way = "ahead of" if running.ahead_s > 0 else "behind"
-        yield Finding(
-            "clock",
-            "warning",
-            f"the daemon's clock is {abs(running.ahead_s):.1f} s {way} this machine's",
-            "let NTP set the clocks of both machines (timedatectl), or let the clients echo the "
-            "key beat (page explanation/commands of the manual): commands with an echo do not need "
-            "a common clock",
-        )
+        yield finding("clock_apart", seconds=abs(running.ahead_s), way=way)
 
 
 def routers(config: Config, running: bool) -> Iterator[Finding]:
@@ -268,16 +225,9 @@ def routers(config: Config, running: bool) -> Iterator[Finding]:
     """
     for endpoint in config.bus.connect:
         if not running and not answers(endpoint):
-            mend = "start the Zenoh router there (rmw_zenohd, zenohd or `acsard router`)"
-            yield Finding("router", "warning", f"no program listens at {endpoint}", mend)
+            yield finding("router_absent", endpoint=endpoint)
         if not is_tls(endpoint) and _others_reach(endpoint):
-            yield Finding(
-                "bus",
-                "warning",
-                f"the daemon connects to the router at {endpoint} without TLS: every program that "
-                "is connected to that router has the rights of this machine",
-                "let the router listen only on loopback, or let the daemon connect to it over TLS",
-            )
+            yield finding("bus_open", endpoint=endpoint)
 
 
 def _others_reach(endpoint: str) -> bool:
@@ -288,11 +238,4 @@ def _others_reach(endpoint: str) -> bool:
 def gateway(config: Config) -> Iterator[Finding]:
     """Yield a finding for each endpoint of the TLS gateway: does a program listen there?"""
     for endpoint in config.bus.outside:
-        if answers(endpoint):
-            yield Finding("gateway", "ok", f"open at {endpoint}")
-        else:
-            mend = (
-                "`systemctl status acsard-gateway` shows why the TLS gateway does not run; without "
-                "the systemd service, `acsard run` starts a gateway by itself"
-            )
-            yield Finding("gateway", "warning", f"no program listens at {endpoint}", mend)
+        yield finding("gateway_open" if answers(endpoint) else "gateway_absent", endpoint=endpoint)

@@ -10,7 +10,7 @@ from rich.text import Text
 
 from acsard.core.formatting import printable, rough, signed
 from acsard.core.messages.schema import RobotState
-from acsard.core.messages.state_warnings import SAME_AS_REASON, brief, charge, warnings
+from acsard.core.messages.state_warnings import beside_reason, brief, charge, warnings
 from acsard.host.version import order
 from acsard.top.roster import Row, absence
 
@@ -82,8 +82,7 @@ def _version(state: RobotState, newest: tuple[int, ...]) -> str:
 
 
 def _why(state: RobotState) -> str:
-    same = SAME_AS_REASON.get(state.code)
-    problems = [warning for warning in warnings(state) if warning.what != same]
+    problems = beside_reason(state)
     parts = [printable(state.why)]
     if problems:
         parts.insert(1 if state.mode in URGENT else 0, brief(problems))

@@ -22,7 +22,7 @@ from acsard.core.formatting import lasting, printable, rough, signed
 from acsard.core.messages.schema import Info, RobotState, SourceState
 from acsard.core.messages.short_texts import cause_numbers, power
 from acsard.core.messages.state_warnings import WARNING, brief, warnings
-from acsard.core.motion.gyro import STATUS_TEXTS
+from acsard.core.motion.gyro import STATUS
 from acsard.core.values import NS_PER_S, TWO_WHEELS
 from acsard.daemon.latencies import NAMES
 from acsard.terminal.output import table
@@ -206,16 +206,22 @@ def _sources(state: RobotState) -> Table:
     return _table(("sources", "priority", "seen", "waits for"), rows, (1, 2))
 
 
+SHOWN_GAP_S = 0.25  # the default timeout of a source
+
+
 def _drives(source: SourceState, state: RobotState) -> bool:
     return source.name == state.source and state.mode == "driving" and not source.waits_for
 
 
 def _waits(source: SourceState, state: RobotState) -> str:
-    if source.waits_for:
-        return clean(source.waits_for)
+    parts = [clean(source.waits_for) or f"nothing, but the robot is {clean(state.mode)}"]
     if _drives(source, state):
-        return "nothing: it drives"
-    return f"nothing, but the robot is {clean(state.mode)}"
+        parts = ["nothing: it drives"]
+    elif source.wait == "neutral" and source.linear is not None and source.angular is not None:
+        parts.append(f"it sends {source.linear:.3f} m/s, {source.angular:.3f} rad/s")
+    if source.longest_gap > SHOWN_GAP_S:
+        parts.append(f"commands up to {source.longest_gap:.1f} s apart")
+    return "; ".join(parts)
 
 
 def _facts(data: ScreenData, state: RobotState) -> Table:
@@ -224,7 +230,7 @@ def _facts(data: ScreenData, state: RobotState) -> Table:
         where = "the built-in SIMULATOR" if data.info.simulated else clean(data.info.port)
         rows.append(("port", where))
     if state.gyro != "off":
-        words = {str(does): f"{does}: {text}" for does, text in STATUS_TEXTS.items()}
+        words = {str(does): f"{does}: {why.text}" for does, why in STATUS.items()}
         rows.append(("gyro", words.get(state.gyro, clean(state.gyro))))
     if inputs := _board(state):
         rows.append(("board", inputs))

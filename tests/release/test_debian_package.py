@@ -45,8 +45,6 @@ MACHINES = ("amd64", "arm64")
 LIMIT_MB = 60
 
 OF_A_CLONE = (
-    # A page of the clone, which the package does not have.
-    "tests/unit/test_state_codes.py::test_the_page_lists_the_codes_of_the_sources",
     # With the package's gateway, `tls init` also writes its drop-in.
     "tests/unit/test_cli_transcripts.py::test_each_command_prints_what_its_transcript_says[tls]",
 )

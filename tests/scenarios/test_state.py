@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import pytest
 
-from acsard.core.messages.diagnostics import OK, WARN
 from acsard.core.messages.schema import DiagnosticArray, DiagnosticStatus
 from tests.scenarios.speakers import Speaker, Way
 from tests.scenarios.world import World
+
+OK, WARN = 0, 1
 
 
 @pytest.fixture

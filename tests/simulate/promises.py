@@ -14,7 +14,10 @@ from bisect import bisect_right
 from collections import Counter, deque
 from typing import Any, get_args
 
-from acsard.core.codes import GUARD_CODES, FaultCode, LinkCode, StopCode, WaitCode
+from acsard.core.tables.link_codes import LinkCode
+from acsard.core.tables.motor_codes import GUARD_CODES, FaultCode
+from acsard.core.tables.sender_codes import WaitCode
+from acsard.core.tables.stop_codes import StopCode
 from tests.simulate.ages import MARGIN_NS, Ages, Sender, Wish
 from tests.simulate.jerk import STEP, Slope
 from tests.simulate.roads import NS, Message, Sample

@@ -14,7 +14,7 @@ import re
 from collections.abc import Callable
 from typing import Any, get_args
 
-from acsard.core.codes import FaultCode
+from acsard.core.tables.motor_codes import FaultCode
 from tests.simulate.promises import BrokenError, Witness
 from tests.simulate.roads import NS
 

@@ -8,7 +8,7 @@ from typing import get_args
 
 import pytest
 
-from acsard.core.codes import AgeCode
+from acsard.core.tables.sender_codes import AgeCode
 from tests.system.bystander import lost
 from tests.system.harness import (
     Bus,

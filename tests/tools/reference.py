@@ -20,11 +20,21 @@ from msgspec.structs import replace
 from prometheus_client.parser import text_string_to_metric_families
 
 from acsard import client
+from acsard.checkup.outcomes import OUTCOMES_BY_CODE
 from acsard.cli.command_line import parser
-from acsard.core.codes import CODES
 from acsard.core.messages.json_schema import SCHEMAS
 from acsard.core.messages.schema import BatterySummary
 from acsard.core.ros.transports import ros_names
+from acsard.core.tables.bus_codes import BUS
+from acsard.core.tables.certificate_codes import CERTIFICATES
+from acsard.core.tables.computer_codes import COMPUTER
+from acsard.core.tables.file_codes import FILES
+from acsard.core.tables.link_codes import LINK
+from acsard.core.tables.message_codes import MESSAGES
+from acsard.core.tables.motor_codes import MOTORS
+from acsard.core.tables.pose_codes import POSE
+from acsard.core.tables.sender_codes import SENDERS
+from acsard.core.tables.stop_codes import STOPS
 from acsard.web.app import ROUTES
 from acsard.web.metrics import text as metrics_text
 from tests.system.contract import matrix
@@ -253,19 +263,34 @@ def python_client() -> str:
 
 def codes() -> str:
     """Return the text and the advice of each code."""
-    rows = (
-        (f"`{code}`", _said(entry.text), _said(entry.advice))
-        for code, entry in CODES.items()
-        if entry.text
-    )
+    sections = {
+        "Why the robot does not move": SENDERS | STOPS,
+        "Motors and wheels": MOTORS,
+        "The link to the board, and its port": LINK,
+        "Pose and gyro": POSE,
+        "Refused messages": MESSAGES,
+        "Files": FILES,
+        "Certificates": CERTIFICATES,
+        "The computer": COMPUTER,
+        "Daemon, router and gateway": BUS,
+        "Results of `acsard mcu check`": OUTCOMES_BY_CODE,
+    }
+    texts = []
+    for title, entries in sections.items():
+        rows = (
+            (f"`{code}`", entry.level, _said(entry.text or entry.figure), _said(entry.advice))
+            for code, entry in entries.items()
+            if entry.text or entry.level != "ok"
+        )
+        texts += [f"## {title}\n", table(("code", "level", "text", "what to do"), rows)]
     return _page(
         "Codes and advice",
-        "`code` in `state`, `sources`, `causes` and the events says in one word why the robot does "
-        "not move, and what went wrong.\nWords in capitals stand for values. `acsard doctor` and "
-        "`acsard echo state -n 1 --short` print the text of your robot.\n"
-        "`wheel_fault` in `state` is no code and stops nothing: [when a wheel fails]"
-        "(../explanation/wheels.md).",
-        table(("code", "text", "what to do"), rows),
+        "`code` in `state`, `sources`, `causes`, events, `diagnostics`, `acsard doctor --json` "
+        "and `acsard mcu check --json` says in\none word why the robot does not move, and what "
+        "went wrong. Words in capitals stand for values. `acsard doctor` and\n`acsard echo state "
+        "-n 1 --short` print the text of your robot. `wheel_fault` in `state` is a text, and stops "
+        "nothing:\n[when a wheel fails](../explanation/wheels.md).",
+        *texts,
     )
 
 

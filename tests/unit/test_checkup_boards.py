@@ -15,6 +15,7 @@ import pytest
 
 from acsard.checkup import inputs
 from acsard.checkup.findings import Finding, motor_name
+from acsard.core.config.motion_rules import top_wheel_speed
 from acsard.core.config.settings import (
     Config,
     FeedbackConfig,
@@ -195,7 +196,8 @@ def test_the_check_names_each_fault_and_nothing_else(
         checked = Checked(robot, person)
         assert not checked.left_turning
         sent = [line for line in robot.sent if b"x" not in line]
-        assert max(float(speed) for line in sent for speed in SPEED.findall(line)) <= 3.0
+        top = max(3.0, top_wheel_speed(robot.config))
+        assert max(float(speed) for line in sent for speed in SPEED.findall(line)) <= top
         text += f"== {name}\n"
         for finding in checked.findings:
             if not (finding in first or (finding.verdict == "PASS" and finding.name in passed)):

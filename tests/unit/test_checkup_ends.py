@@ -9,10 +9,12 @@ from typing import Any
 
 import pytest
 from msgspec import structs
+from msgspec.structs import replace
 
 from acsard.checkup import procedure
 from acsard.checkup.board import FINAL_ZEROS
 from acsard.checkup.findings import Finding, WireLostError, motor_name
+from acsard.core.config.motion_rules import top_wheel_speed
 from acsard.core.config.settings import Config, SimConfig
 from acsard.core.link.codec import MotorCodec
 from acsard.core.simulator import protocol
@@ -65,7 +67,8 @@ def test_a_q_typed_while_a_motor_turns_ends_the_check(typed: str) -> None:
 
     with robot.faulty(), pytest.raises(KeyboardInterrupt):
         procedure.run(robot, Quits(robot), robot.config, lambda finding: None)
-    assert questions == [procedure.CONFIRMATION]
+    top = top_wheel_speed(robot.config)
+    assert questions == [procedure.CONFIRMATION.format(top=top)]
     assert b"".join(robot.sent[-5:]).count(stop_lines(robot.config)[0]) == FINAL_ZEROS
     assert robot.later() == [0.0] * 4
 
@@ -255,6 +258,9 @@ def test_firmware_that_regulates_is_not_left_at_full_speed(
 ) -> None:
     motor = len(config.mcu.wheels.names) - 2  # for the last motor the check tries both line ends
     name = motor_name(config.mcu, motor)
+    # The step of the highest speed then commands no more than the others.
+    limits = replace(config.limits, linear_speed=0.1, angular_speed=0.1)
+    config = replace(config, limits=limits)
     robot = Regulates(f"{fault}={config.mcu.wheels.letters[motor]}", config=config)
     checked = Checked(robot)
     assert checked.failed == [name]
@@ -277,7 +283,7 @@ def test_after_a_runaway_zeros_are_sent_once_and_then_nothing() -> None:
 
 
 @FOUR_AND_TWO
-def test_no_motor_is_commanded_above_3_rad_s_or_for_4_s(config: Config) -> None:
+def test_without_a_watchdog_no_motor_is_commanded_above_3_rad_s_or_for_4_s(config: Config) -> None:
     robot = Robot("plain_only", "no_watchdog", config=config)
     Checked(robot)
     letters = config.mcu.wheels.letters

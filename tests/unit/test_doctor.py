@@ -24,7 +24,6 @@ from acsard.daemon.serial.device import refusal
 from acsard.host import real_time
 from acsard.host.errors import CertificateError, NoAnswerError
 from acsard.host.kernel_counters import Kernel
-from acsard.host.port_access import WITHOUT_DEVICE
 from acsard.machine import examination, versions
 from acsard.machine.examination import Running, clocks, compared, examine, reported, routers
 from acsard.machine.finding import Finding
@@ -47,11 +46,11 @@ def row(name: str, level: int, message: str, advice: str = "", code: str = "") -
 
 
 def test_a_reason_of_two_reports_is_printed_once_where_it_is_not_ok() -> None:
-    waits = row("mode", 0, "nothing came", code="silent")
-    link = row("serial link", 2, "down: nothing came", "check", code="silent")
+    waits = row("mode", 2, "nothing came", code="received_nothing")
+    link = row("serial link", 2, "down: nothing came", "check", code="received_nothing")
     assert list(reported((waits, link, row("recording", 0, "on")))) == [
-        Finding("serial link", "failure", "down: nothing came", "check"),
-        Finding("recording", "ok", "on"),
+        Finding("serial link", "received_nothing", "failure", "down: nothing came", "check"),
+        Finding("recording", "", "ok", "on"),
     ]
 
 
@@ -199,8 +198,8 @@ def test_a_device_file_without_a_device_is_named_by_doctor_and_daemon(tmp_path: 
     path = str(tmp_path / "ttyUSB0")
     os.mknod(path, 0o660 | stat.S_IFCHR, os.makedev(188, 199))
     (finding,) = serial_port(path, simulated=False)
-    assert (finding.level, finding.text) == ("failure", f"{path} {WITHOUT_DEVICE}")
-    assert WITHOUT_DEVICE in str(refusal(path, OSError(errno.ENXIO, "no such device")))
+    assert (finding.code, finding.level) == ("port_orphan", "failure")
+    assert finding.text in str(refusal(path, OSError(errno.ENXIO, "no such device")))
     assert next(serial_port("/dev/null", simulated=False)).level == "ok"
 
 

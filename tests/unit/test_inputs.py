@@ -85,7 +85,7 @@ def bumpers(*places: Place, bumper: str = "stop") -> Input:
 
 
 def pressed(words: str) -> Reason:
-    return reason("bumper", part=f"{words} pressed", bumpers=f"{words} pressed")
+    return reason("bumper", f"{words} pressed", bumpers=f"{words} pressed")
 
 
 # the same for both

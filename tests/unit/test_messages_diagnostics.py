@@ -49,8 +49,18 @@ BUSY = {"lines": 9_000, "lines_sent": 9_000}
 DAYS_40 = {"lines": 340_000_000, "lines_sent": 345_600_000}
 APP = SourceStatus("app", 50, 0.1, Wait("nothing"))
 
+CODES = {
+    Mode.INACTIVE: "switched_off",
+    Mode.STOPPED: "stopped",
+    Mode.FAULT: "wheel_reversed",
+    Mode.WAITING: "booting",
+    Mode.READY: "no_command",
+    Mode.DRIVING: "commanded",
+    Mode.SHUTDOWN: "shutting_down",
+}
+
 SITUATIONS: dict[str, tuple[Config, dict[str, Any]]] = {
-    **{f"the mode {mode}": (CONFIG, {"mode": mode}) for mode in Mode},
+    **{f"the mode {mode}": (CONFIG, {"mode": mode, "code": code}) for mode, code in CODES.items()},
     "a fault of the driver": (CONFIG, {"mode": "fault", "code": "driver_fault"}),
     "a fault of acsard": (CONFIG, {"mode": "fault", "code": "guard_too_fast"}),
     **{f"a link that is {link}": (CONFIG, {"link": link}) for link in ("stale", "booting", "down")},
@@ -58,7 +68,7 @@ SITUATIONS: dict[str, tuple[Config, dict[str, Any]]] = {
         CONFIG, {"mode": "waiting", "link": "down", "code": "port_trouble"},
     ),
     "a port that was released": (
-        CONFIG, {"mode": "stopped", "link": "down", "port_released": True},
+        CONFIG, {"mode": "stopped", "code": "stopped", "link": "down", "port_released": True},
     ),
     "a late computer": (CONFIG, {"link": "stale", "code": "host_late"}),
     "the simulator": (Config(), {}),
@@ -132,7 +142,7 @@ SITUATIONS: dict[str, tuple[Config, dict[str, Any]]] = {
 
 
 def statuses(config: Config = CONFIG, **changes: Any) -> list[DiagnosticStatus]:
-    return diagnostics(config, OUTPUTS.now, changed(SNAPSHOT, **changes), ("", "")).status
+    return diagnostics(config, OUTPUTS.now, changed(SNAPSHOT, **changes), None).status
 
 
 def words(status: DiagnosticStatus) -> list[str]:

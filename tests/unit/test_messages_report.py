@@ -22,7 +22,7 @@ from acsard.core.config.settings import (
     RobotConfig,
     WheelMap,
 )
-from acsard.core.messages.certificate_expiry import DAY_NS, expiry
+from acsard.core.messages.certificate_expiry import DAY_NS, expiry, short_code
 from acsard.core.messages.keys_and_roles import BEAT, PUBLISHED
 from acsard.core.messages.report import Report, from_yaw
 from acsard.core.messages.schema import (
@@ -48,7 +48,7 @@ from acsard.core.messages.schema import (
     Vector3,
 )
 from acsard.core.messages.snapshot import Snapshot
-from acsard.core.motion.gyro import STATUS_TEXTS
+from acsard.core.motion.gyro import STATUS
 from acsard.core.values import (
     WHEELS,
     BatteryStatus,
@@ -206,7 +206,7 @@ def test_gyro_and_wheels_are_in_diagnostics_as_in_the_state() -> None:
     assert state_of()[0].gyro == "off"
     for does in ("used", "silent"):
         state, rows = state_of(wide, gyro=does)
-        assert (state.gyro, rows["gyro"].message) == (does, STATUS_TEXTS[does])
+        assert (state.gyro, rows["gyro"].message) == (does, STATUS[does].text)
     text = "rear_left is left out"
     state, rows = state_of(wheel_fault=text)
     assert (state.wheel_fault, rows["wheels"].message) == (text, text)
@@ -238,17 +238,22 @@ def test_a_certificate_that_expires_soon_is_reported(days: int, level: int, word
 
 def test_the_certificate_that_expires_first_is_named_unless_it_is_the_robot_s_own() -> None:
     now_ns = OUTPUTS.now.wall_ns
+
+    def told(ends: dict[str, int]) -> tuple[str, str]:
+        why = expiry(ends, now_ns)
+        return short_code(why), why.text
+
     ends = {"": now_ns + 10 * DAY_NS, "the authority": now_ns + 400 * DAY_NS}
-    assert expiry(ends, now_ns) == ("expires", "expires in 10 days")
+    assert told(ends) == ("expires", "expires in 10 days")
     # The gateway's report is the earlier expiry of its own certificate and of its authority's.
     both = ends | {"the authority": ends[""]}
-    assert expiry(both, now_ns)[1].endswith(" (certificate of the authority)")
+    assert told(both)[1].endswith(" (certificate of the authority)")
     ends["the router tls/router.local:7447"] = now_ns - 3 * DAY_NS
     text = "expired 3 days ago (certificate of the router tls/router.local:7447)"
-    assert expiry(ends, now_ns) == ("expired", text)
+    assert told(ends) == ("expired", text)
     ends[""] = now_ns - DAY_NS
-    assert expiry(ends, now_ns) == ("expired", f"{text}: TLS refuses every client")
-    assert expiry({}, now_ns)[0] == "unknown"
+    assert told(ends) == ("expired", f"{text}: TLS refuses every client")
+    assert told({})[0] == "unknown"
 
 
 # who gets what

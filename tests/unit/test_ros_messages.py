@@ -45,8 +45,8 @@ STATE = RobotState(
     stamp=Time(5, 6), mode="driving", reason="commanded by app", x=1.0, y=2.0, yaw=0.5,
     linear=0.3, angular=0.1, wheels=[1.0, 2.0, 3.0, 4.0], link="up", source="app",
     sources=[
-        SourceState("app", 50, 0.1, "", "nothing"),
-        SourceState("nav", 10, None, "a command", "command"),
+        SourceState("app", 50, 0.1, "", "nothing", 0.3, 0.1, 0.2),
+        SourceState("nav", 10, 0.3, "a command", "command", 0.1, -0.2, 0.7),
     ],
     refused="", counters={"lines": 7, "commands": 2}, sender="joystick", feedback_age=0.01,
     emergency_stop="released", bumpers=[False, True],
@@ -158,10 +158,19 @@ def test_the_ros_state_has_the_values_of_the_native_state() -> None:
 
 
 def test_null_fields_of_the_state_are_nan_in_ros() -> None:
-    none = replace(STATE, linear=None, angular=None, wheels=[], feedback_age=None, bumpers=None)
+    silent = [SourceState("app", 50, None, "", "nothing")]
+    none = replace(
+        STATE,
+        linear=None,
+        angular=None,
+        wheels=[],
+        feedback_age=None,
+        bumpers=None,
+        sources=silent,
+    )
     unknown = state(none)
     message = read(STATE_CHANNEL, STATE_CHANNEL.encode(none))
-    numbers = (message.linear, message.angular, message.feedback_age, message.sources[1].age)
+    numbers = (message.linear, message.angular, message.feedback_age, message.sources[0].linear)
     assert all(map(math.isnan, numbers))
     assert (len(message.wheels), len(message.bumpers), message.x) == (0, 0, 1.0)
     assert Cdr(RosState).decode(Cdr(RosState).encode(unknown)) == unknown

@@ -1,29 +1,24 @@
-"""Each code of the table is produced somewhere, and no other code is published."""
+"""Each code of the tables is used, each use has a row, and no other code is published."""
 
 from __future__ import annotations
 
+import ast
 import re
 import string
+from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
-from typing import get_args
+from typing import cast, get_args
 
 import acsard
-from acsard.core.codes import CODES, Code, StateCode, StopCode, joined, reason, sentence
+from acsard.checkup.outcomes import OUTCOMES_BY_CODE
+from acsard.core.codes import CODES, Code, StateCode, sentence
+from acsard.core.tables.finding_table import Entry, code_of
+from acsard.core.tables.stop_codes import StopCode
 from acsard.recording.file import SUFFIX, Recording
 from tests import recordings
 
 PACKAGE = Path(acsard.__file__).parent
-
-VALUES = {
-    "source": "app", "seconds": 0.5, "alone": "", "lasts": "", "ros": "", "note": "2",
-    "firmware": "", "others": "2 other senders", "bumpers": "front bumper pressed",
-    "direction": "backwards",
-    "speed": 0.1, "by": "ann", "cause": "why", "places": "1 place", "dots": ".",
-    "threshold": "21 V", "charged": "21.4 V", "wheel": "rear_left", "figures": "(1 rad/s)",
-    "trouble": "why", "received": "nothing", "interval": "0.20", "longest": 0.25,
-    "named": "rain", "wheels": "front_left and front_right", "share": "50 %",
-}  # fmt: skip
-"""A value for each name in the texts."""
 
 
 def test_the_recordings_publish_only_codes_of_the_table() -> None:
@@ -37,18 +32,81 @@ def test_the_recordings_publish_only_codes_of_the_table() -> None:
     assert len(seen) > 5
 
 
-def test_every_text_and_every_advice_is_a_sentence_that_needs_only_known_values() -> None:
-    names = set()
-    for code in get_args(Code):
-        entry = CODES[code]
-        for part in (entry.text, entry.advice):
-            names |= {name for _, name, _, _ in string.Formatter().parse(part) if name}
-        why = sentence(code, **VALUES)
+CALLS = ("reason", "sentence", "finding", "find")
+TABLE = {**CODES, **OUTCOMES_BY_CODE}
+
+
+def names_in(entry: Entry) -> set[str]:
+    parts = " ".join((entry.figure, entry.text, entry.advice))
+    return {name for _, name, _, _ in string.Formatter().parse(parts) if name}
+
+
+@cache
+def nodes() -> list[ast.AST]:
+    """Return the nodes of the package outside of the tables themselves."""
+    tables = (PACKAGE / "core/tables", PACKAGE / "checkup/outcomes.py")
+    return [
+        node
+        for path in PACKAGE.rglob("*.py")
+        if not any(path.is_relative_to(table) for table in tables)
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
+    ]
+
+
+def literals(node: ast.expr) -> Iterator[str]:
+    """Yield the texts that an expression may be, if they are literal."""
+    match node:
+        case ast.Constant(value=str(text)):
+            yield text
+        case ast.IfExp(body=body, orelse=orelse):
+            yield from (*literals(body), *literals(orelse))
+
+
+def test_every_text_and_every_advice_is_a_sentence() -> None:
+    for code, entry in CODES.items():
+        why = sentence(cast("Code", code), **dict.fromkeys(names_in(entry), 1))
         assert why.code == code
         assert why.text or code == "nothing"
-        assert not re.search(r"[;:]$|  ", why.text)
-        assert joined(reason(code, "", **VALUES)).text == why.text
-    assert names == set(VALUES)
+        assert not re.search(r"[;:]$|  |->", why.text), code
+    assert not CODES.keys() & OUTCOMES_BY_CODE.keys()
+
+
+def test_every_call_names_a_code_and_gives_the_values_of_its_texts() -> None:
+    calls = 0
+    for node in nodes():
+        if not isinstance(node, ast.Call) or not node.args:
+            continue
+        name = getattr(node.func, "id", getattr(node.func, "attr", ""))
+        owner = getattr(getattr(node.func, "value", None), "id", "outcomes")
+        if name not in CALLS or owner != "outcomes":
+            continue
+        given = {keyword.arg for keyword in node.keywords}
+        for text in literals(node.args[0]):
+            code = code_of(text)
+            assert code in TABLE, f"line {node.lineno}: {text} has no row in a table of codes"
+            missing = names_in(TABLE[code]) - given if None not in given else ()
+            assert not missing, f"line {node.lineno}: {text} needs {missing}"
+            calls += 1
+    assert calls > 150
+
+
+def test_every_code_is_used() -> None:
+    """A code that nothing names is left over; an f-string names all that it can make."""
+    names: set[str] = set()
+    made: list[re.Pattern[str]] = []
+    for node in nodes():
+        match node:
+            case ast.Constant(value=str(text)):
+                names.add(code_of(text[:60]))
+            case ast.JoinedStr(values=[ast.Constant(value=str(first)), *rest]) if re.fullmatch(
+                "[a-z][a-z ]*(_|: )", first
+            ):
+                ends = [p.value if isinstance(p, ast.Constant) else ".+" for p in rest]
+                made.append(re.compile("".join(map(str, [first, *ends]))))
+    for code, entry in TABLE.items():
+        said = f"{entry.subject}: {code[len(code_of(entry.subject)) + 1 :].replace('_', ' ')}"
+        used = code in names or any(p.fullmatch(code) or p.fullmatch(said) for p in made)
+        assert used, f"{code} has a row in a table of codes, and nothing names it"
 
 
 def test_each_stop_and_each_reason_to_rest_says_what_to_do() -> None:

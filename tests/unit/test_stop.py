@@ -32,7 +32,7 @@ FLAT = reason("battery_empty", threshold="22 V", charged="24 V")
 
 
 def dead(part: str) -> Reason:
-    return reason("wheel_reversed", part=part, wheel=part, figures="(1)")
+    return reason("wheel_reversed", part, wheel=part, figures="(1)")
 
 
 def ns(seconds: float) -> int:

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import get_args
 
-from acsard.core.codes import ObjectionCode, Reason, WaitCode
+from acsard.core.codes import Reason
 from acsard.core.config.settings import CommandsConfig, Source
 from acsard.core.link.step_times import StepTimes
 from acsard.core.motion.ages import MAX_CLOCKS
@@ -21,6 +21,8 @@ from acsard.core.motion.arbiter_text import (
     waiting,
 )
 from acsard.core.motion.modes import Mode
+from acsard.core.tables.message_codes import ObjectionCode
+from acsard.core.tables.sender_codes import WaitCode
 from acsard.core.values import NS_PER_S, REST, Command, Echo, Event, Refusal, Wait
 from tests.each import each
 from tests.unit.commanders import GO, MS, SOURCES, Commanders, begin

@@ -48,6 +48,11 @@ def _reach(config: Config) -> _Reach:
     )
 
 
+def top_wheel_speed(config: Config) -> float:
+    """Return the highest speed that `[limits]` let the daemon command to a wheel, rad/s."""
+    return _reach(config).wheel
+
+
 def _braking_problems(config: Config, axis: str, speed: float, unit: str) -> list[str]:
     errors = []
     softer = f"{axis}_deceleration"

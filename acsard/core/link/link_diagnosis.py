@@ -7,16 +7,17 @@ same diagnosis. The diagnosis does not change the state of the link, which `link
 from __future__ import annotations
 
 import re
-from typing import Literal
 
 from msgspec import Struct, field
+from msgspec.structs import replace
 
-from acsard.core.codes import CODES, Reason, sentence
+from acsard.core.codes import CODES, Reason, joined, reason, sentence
 from acsard.core.formatting import many, printable_bytes
 from acsard.core.link.codec import SPEED
 from acsard.core.link.link_setup import LinkSetup
 from acsard.core.link.link_state import Link, LinkState
 from acsard.core.link.step_times import StepTimes
+from acsard.core.tables.link_codes import ReceivedCode
 from acsard.core.values import NS_PER_S, TWO_WHEELS, WHEELS, Event, Ns
 
 BUSY_ADVICE = CODES["host_late"].advice
@@ -33,21 +34,14 @@ FIRST_DIAGNOSIS_NS = 3 * NS_PER_S  # a board that is only booting answers within
 
 MAX_SHOWN_BYTES = 64  # a complete line and some noise
 
-# statuses: only status lines. text, form: most bad lines are text, or replies in another form. cut:
-# pieces of valid lines, or no line ends. foreign: valid lines within other bytes. garbage: nothing
-# like a line. few: good lines, and bad ones. sparse: too few lines.
-ReceivedCode = Literal[
-    "received_nothing", "received_statuses", "received_text", "received_form", "received_letters",
-    "received_cut", "received_foreign", "received_garbage", "received_few", "received_sparse",
-    "received_brownout", "received_boot", "received_nmea",
-]  # fmt: skip
-
 # Text that names its sender, or what happened to it. Noise does not make it.
 _NAMED: dict[ReceivedCode, re.Pattern[bytes]] = {
     "received_brownout": re.compile(rb"Brownout detector|BROWN_?OUT"),
     "received_boot": re.compile(rb"rst:0x[0-9a-f]|ESP-ROM:|^ets [A-Z][a-z]{2} "),
     "received_nmea": re.compile(rb"^\$[A-Z]{5},.*\*[0-9A-F]{2}$"),
 }
+
+FIND_OUT_MORE = "; `acsard mcu check` finds out more"
 
 CHECKED_FIRMWARE = ', does its firmware support mcu.link_check = "on" (else write "off")'
 
@@ -195,8 +189,13 @@ class Traffic(Struct):
         if self.code == "received_sparse" and self.late_s:
             received = "too few lines for a link"
             return sentence("host_late", seconds=self.late_s, received=received)
-        firmware = CHECKED_FIRMWARE if checked else ""
-        return sentence(self.code, received=self.counted, firmware=firmware, wheels=self.wheels)
+        why = joined(self.reason(firmware=CHECKED_FIRMWARE if checked else ""))
+        return why if self.named else replace(why, text=f"{why.text}{FIND_OUT_MORE}")
+
+    def reason(self, where: str = "{}", firmware: str = "") -> Reason:
+        """Return what the bytes show, and what to do; `where` says more about the bytes."""
+        received = where.format(self.counted)
+        return reason(self.code, received=received, firmware=firmware, wheels=self.wheels)
 
 
 class SilenceDiagnosis(Struct):

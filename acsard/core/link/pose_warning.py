@@ -12,11 +12,11 @@ from typing import Literal
 
 from msgspec import Struct
 
-from acsard.core.codes import PoseCode
 from acsard.core.link.coarse_encoders import JUMP_ANGLE
 from acsard.core.link.feedback import Timeline
 from acsard.core.link.line_times import NARROW_DEVIATION
 from acsard.core.link.link_setup import LinkSetup
+from acsard.core.tables.pose_codes import PoseCode
 
 WINDOW_LINES = 500  # 5 s at 100 Hz
 

@@ -5,38 +5,41 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Literal
 
+from acsard.core.codes import Reason, reason
 from acsard.core.values import NS_PER_S, WallNs
 
 EXPIRY_DAYS = 30  # remaining, below which `state` and `diagnostics` warn
 
 DAY_NS = 86400 * NS_PER_S
 
+# In `state`; behind `certificate_`, the code of the finding.
+Expiry = Literal["valid", "expires", "expired", "unknown"]
 
-CertificateCode = Literal["valid", "expires", "expired", "unknown"]
-
-# 0 ok, 1 warning, 2 error.
-CERTIFICATE_LEVELS: dict[str, int] = {"valid": 0, "expires": 1, "expired": 2, "unknown": 1}
+DOCTOR = "run `acsard doctor` on the daemon's machine, where it examines the certificate files"
 
 
-def expiry(ends: Mapping[str, WallNs], now_ns: WallNs) -> tuple[CertificateCode, str]:
-    """Return a code and a text about the certificate that expires first.
+def expiry(
+    ends: Mapping[str, WallNs], now_ns: WallNs, advice: str = DOCTOR, where: str = ""
+) -> Reason:
+    """Return the finding about the certificate that expires first.
 
     `ends` is by owner, "" for the robot's own, and empty if nothing is known.
     """
     if not ends:
-        return (
-            "unknown",
-            "unknown: the TLS gateway is not running, or the library that reads certificates is "
-            "missing (`acsard doctor` says which)",
-        )
+        return reason("certificate_unknown", advice=advice)
     whose, ends_ns = first_expiry(ends)
-    of = f" (certificate of {whose})" if whose else ""
     days = (ends_ns - now_ns) / DAY_NS
+    of = f" (certificate of {whose})" if whose else ""
+    values = {"days": f"{abs(days):.0f}", "of": of, "where": where, "advice": advice}
     if days < 0:
-        return "expired", f"expired {-days:.0f} days ago{of}{_effect(ends, now_ns)}"
-    if days < EXPIRY_DAYS:
-        return "expires", f"expires in {days:.0f} days{of}"
-    return "valid", f"valid for {days:.0f} days{of}"
+        values["of"] += _effect(ends, now_ns)
+        return reason("certificate_expired", **values)
+    return reason("certificate_expires" if days < EXPIRY_DAYS else "certificate_valid", **values)
+
+
+def short_code(why: Reason) -> str:
+    """Return the `Expiry` of a finding of `expiry`."""
+    return why.code.removeprefix("certificate_")
 
 
 def _effect(ends: Mapping[str, WallNs], now_ns: WallNs) -> str:

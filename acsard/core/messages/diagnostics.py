@@ -12,13 +12,19 @@ from collections.abc import Iterator, Sequence
 from typing import cast
 
 from msgspec import Struct
+from msgspec.structs import replace
 
-from acsard.core.codes import GUARD_CODES, HOST_CODES, PoseCode, sentence
+from acsard.core.codes import Code, Reason, reason, sentence
 from acsard.core.config.settings import Config
 from acsard.core.config.wire_time import wire_use
 from acsard.core.formatting import many
-from acsard.core.link.link_diagnosis import BUSY_ADVICE, MAX_UNANSWERED_FRACTION
-from acsard.core.messages.certificate_expiry import CERTIFICATE_LEVELS
+from acsard.core.link.link_diagnosis import (
+    BUSY_ADVICE,
+    FIND_OUT_MORE,
+    MAX_UNANSWERED_FRACTION,
+    STATE_REASONS,
+)
+from acsard.core.link.link_state import LinkState
 from acsard.core.messages.schema import (
     DiagnosticArray,
     DiagnosticStatus,
@@ -29,7 +35,7 @@ from acsard.core.messages.schema import (
 )
 from acsard.core.messages.snapshot import Snapshot
 from acsard.core.motion import battery
-from acsard.core.motion.arbiter_text import waiting
+from acsard.core.motion.arbiter_text import NO_COMMAND, waiting
 from acsard.core.motion.bumpers import missing_reason
 from acsard.core.motion.emergency_stop import (
     DRIVER_FAULT_REASON,
@@ -37,7 +43,11 @@ from acsard.core.motion.emergency_stop import (
     PRESSED_REASON,
     SILENT_REASON,
 )
-from acsard.core.motion.gyro import STATUS_TEXTS
+from acsard.core.motion.gyro import STATUS
+from acsard.core.tables.finding_table import LEVELS
+from acsard.core.tables.link_codes import HOST_CODES
+from acsard.core.tables.motor_codes import GUARD_CODES
+from acsard.core.tables.pose_codes import PoseCode
 from acsard.core.values import (
     GyroDoes,
     Instant,
@@ -45,29 +55,27 @@ from acsard.core.values import (
     RoutersStatus,
 )
 
-OK, WARN, ERROR = 0, 1, 2
+HELD = ("stopped", "fault")  # modes that a person ends
 
-MODE_LEVELS = {"stopped": WARN, "fault": ERROR}  # of modes; others are OK
-
-# Rows by the state of the emergency-stop input.
-BOARD = {
-    "": (OK, "no emergency-stop input", ""),
-    "released": (OK, "emergency stop released", ""),
-    "pressed": (WARN, PRESSED_REASON.text, PRESSED_REASON.advice),
-    "silent": (ERROR, SILENT_REASON.text, SILENT_REASON.advice),
+# Findings by the state of the emergency-stop input.
+ESTOP: dict[str, Reason] = {
+    "": reason("no_emergency_stop"),
+    "released": reason("emergency_stop_released"),
+    "pressed": PRESSED_REASON,
+    "silent": SILENT_REASON,
 }
 
-BATTERY_LEVELS = {"ok": OK, "warning": WARN, "stop": ERROR, "unknown": WARN}
+BATTERY: dict[str, Code] = {
+    "ok": "battery_ok",
+    "warning": "battery_low",
+    "unknown": "battery_unknown",
+}
 
 SHOW_REFUSAL_S = 2.0  # two messages at the default 1 Hz
 
 MAX_MISSED_FRACTION = 0.01  # of the last minute's periods, above which this warns
 
 NO_ROUTER, NOT_YET = "a peer, not a router", "not connected yet"
-
-SIMULATOR_ADVICE = (
-    "to drive a robot, set mcu.port to the board's serial port; `acsard ports` lists the ports"
-)
 
 PORT_ADVICE = "plug the board in if it is not; `acsard ports` lists the serial ports"
 
@@ -80,52 +88,45 @@ DEFECT = (
     f"recordings), {CLEAR}"
 )
 
-# Advice by the status of the gyro.
-GYRO_ADVICE: dict[GyroDoes, str] = {
-    "silent": "check that the gyro's driver runs, and that it publishes on the Zenoh key `imu` "
-    "(the ROS topic imu/data)",
-    "hangs": "check the gyro's cable and its driver: angular_velocity.z must change in its last "
-    "digits even at rest",
-    "disagrees": "if the wheels do not slip, measure the track with `acsard calibrate`, let the "
-    "robot stand so that it learns the gyro's bias, and check the gyro's scale",
-    "reversed": "check with `acsard mcu check` that the wheels turn the right way; if they do, "
-    "mount the gyro with its z axis up, or let its driver negate angular_velocity.z",
-    "in degrees": "let the gyro's driver send rad/s: divide the degrees per second by 57.3",
-    "dead": "check the gyro's cable and its driver: angular_velocity.z must change when the robot "
-    "turns",
-    "not believed": "check that the gyro's z axis points up and that its driver sends rad/s; then "
-    "measure the track width with `acsard calibrate`",
-}
-
-# Level, text, and advice for a level that is not OK.
-Finding = tuple[int, str, str]
-
 
 class Row(Struct, frozen=True):
     """A row about one part of the robot, with details as text in `values`."""
 
     name: str
-    level: int
-    message: str
+    findings: Sequence[Reason]
     values: dict[str, str]
-    advice: str = ""
+
+    def message(self, robot_id: str) -> DiagnosticStatus:
+        """Return the row with the code of its first finding of the highest level."""
+        worst = max(self.findings, key=lambda why: LEVELS.index(why.level))
+        advice = [why.advice for why in self.findings if why.level != "ok" and why.advice]
+        values = {"code": worst.code} | self.values
+        if advice:
+            values["advice"] = "; ".join(dict.fromkeys(advice))
+        return DiagnosticStatus(
+            LEVELS.index(worst.level),
+            f"acsard: {self.name}",
+            "; ".join(why.text.rstrip(";:") for why in self.findings),
+            robot_id,
+            [KeyValue(key, value) for key, value in values.items()],
+        )
 
 
 def diagnostics(
     config: Config,
     now: Instant,
     snapshot: Snapshot,
-    certificate: tuple[str, str],
+    certificate: Reason | None,
 ) -> DiagnosticArray:
     """Return the message with one row for each part of the robot.
 
-    `certificate` is the result of `expiry`, or two "" for no such row.
+    `certificate` is the result of `expiry`, or None for no such row.
     """
     rows = [
         _mode(snapshot.state),
         _serial_link(config, snapshot),
         _control_loop(snapshot),
-        _commands(snapshot),
+        _commands(config, snapshot),
         _wheels(config, snapshot),
         *_board(config, snapshot),
         *_battery(config, snapshot),
@@ -133,39 +134,19 @@ def diagnostics(
         *_routers(config.bus.connect, snapshot.routers),
         *_recording(snapshot.recording),
         *_latch_file(snapshot.latch_file),
-        *_certificate(*certificate),
+        *_certificate(certificate),
         _settings(snapshot.state.settings_differ),
     ]
-    return DiagnosticArray(
-        Header(Time.from_ns(now.wall_ns)),
-        [
-            DiagnosticStatus(
-                row.level,
-                f"acsard: {row.name}",
-                row.message,
-                config.robot.id,
-                [KeyValue(key, value) for key, value in row.values.items()]
-                + ([KeyValue("advice", row.advice)] if row.advice else []),
-            )
-            for row in rows
-        ],
-    )
-
-
-def _row(name: str, findings: Sequence[Finding], values: dict[str, str]) -> Row:
-    level = max(level for level, _, _ in findings)
-    advice = dict.fromkeys(advice for level, _, advice in findings if level and advice)
-    return Row(name, level, "; ".join(text for _, text, _ in findings), values, "; ".join(advice))
+    stamp = Header(Time.from_ns(now.wall_ns))
+    return DiagnosticArray(stamp, [row.message(config.robot.id) for row in rows])
 
 
 def _mode(status: RobotState) -> Row:
-    advice = ""
-    if status.mode == "stopped":
-        advice = f"remove the cause, {CLEAR}"
-    elif status.mode == "fault":
-        advice = DEFECT if status.code in GUARD_CODES else f"correct the cause, {CLEAR}"
-    values = {"mode": status.mode, "code": status.code, "source": status.source}
-    return Row("mode", MODE_LEVELS.get(status.mode, OK), status.reason, values, advice)
+    why = Reason(cast("Code", status.code), status.reason)
+    if status.mode in HELD:
+        clear = f"remove the cause, {CLEAR}"
+        why = replace(why, advice=DEFECT if why.code in GUARD_CODES else clear)
+    return Row("mode", [why], {"mode": status.mode, "source": status.source})
 
 
 def _check(config: Config) -> str:
@@ -180,140 +161,136 @@ def _serial_link(config: Config, snapshot: Snapshot) -> Row:
     use = wire_use(config.rate_hz, mcu.baud_rate, mcu.line_bytes)
     named = zip(config.mcu.wheels.names, state.encoder_counts, strict=False)
     values = {"port": mcu.port, "wire_use": f"{use:.2f}", "check": snapshot.check}
-    if _is_reason(state):
-        values["code"] = state.code
     if state.feedback_age is not None:
         values["feedback_age_s"] = f"{state.feedback_age:.2f}"
     values |= {f"counts_{name}": str(counts) for name, counts in named if counts}
     values |= _counted(state.counters, "line") | _counted(state.counters, "link")
-    return _row("serial link", [*_link(config, snapshot)], values)
+    return Row("serial link", [*_link(config, snapshot)], values)
 
 
-def _is_reason(status: RobotState) -> bool:
-    # The robot waits because of the link.
-    return status.mode == "waiting" and status.link != "up"
-
-
-def _link(config: Config, snapshot: Snapshot) -> Iterator[Finding]:
+def _link(config: Config, snapshot: Snapshot) -> Iterator[Reason]:
     status, counters, simulated = snapshot.state, snapshot.state.counters, config.mcu.simulated
     by_host = simulated or status.code in HOST_CODES
     advice = BUSY_ADVICE if by_host else _check(config)
     if status.link == "down" and not simulated:
         advice = ACTIVATE if snapshot.port_released else PORT_ADVICE
-    if status.link == "up":
-        yield OK, "up", ""
-    else:
+    why = STATE_REASONS[cast("LinkState", status.link)]
+    if status.link != "up" and status.mode == "waiting":  # the robot waits because of the link
         # The advice says more about the check.
-        reason = status.reason.removesuffix(" `acsard mcu check` finds out more").rstrip(";")
-        why = f": {reason}" if _is_reason(status) else ""
-        yield ERROR, f"{status.link}{why}", advice
+        text = status.reason.removesuffix(FIND_OUT_MORE)
+        why = Reason(cast("Code", status.code), f"{status.link}: {text}")
+    yield replace(why, advice=advice)
     if status.pose_doubt not in ("", "gyro_disagrees", "not_calibrated"):
         doubt = sentence(cast("PoseCode", status.pose_doubt))
-        yield WARN, doubt.text + snapshot.counts_figures, ""
+        yield replace(doubt, text=doubt.text + snapshot.counts_figures)
     if simulated:
-        yield WARN, "this is the simulator, no real wheel turns", SIMULATOR_ADVICE
+        yield reason("port_simulated")
     if snapshot.unanswered:
-        yield WARN, "the board does not answer each line", advice
+        yield reason("lines_unanswered", check=advice)
     refused = {name: n for name, n in counters.items() if name.startswith("line_") and n}
     if sum(refused.values()) > MAX_UNANSWERED_FRACTION * max(1, counters.get("lines", 0)):
         kinds = ", ".join(f"{n} {name[5:].replace('_', ' ')}" for name, n in refused.items())
-        yield WARN, f"lines of the board were rejected: {kinds}", advice
+        yield reason("lines_rejected", kinds=kinds, check=advice)
     # More than once a day on average.
     days = counters.get("lines_sent", 0) / config.rate_hz / 86400
     late = counters.get(f"link_lost{'' if simulated else '_host_stall'}", 0)
     if late > days:
-        times = many(late, "time")
-        yield WARN, f"lost {times}, because this computer did not run the daemon", BUSY_ADVICE
+        yield reason("link_lost_late", times=many(late, "time"), busy=BUSY_ADVICE)
     lost = counters.get("link_lost", 0) - late
     if lost > days:
-        yield WARN, f"lost {many(lost, 'time')} since the start", advice
+        yield reason("link_lost", times=many(lost, "time"), check=advice)
 
 
 def _control_loop(snapshot: Snapshot) -> Row:
     figures, counters = snapshot.state.latencies, snapshot.state.counters
     missed = snapshot.missed_last_minute
     lateness = figures.get("period_lateness")
-    run_count = lateness.last_minute.count if lateness else 0
+    periods = missed + (lateness.last_minute.count if lateness else 0)
     values = {
         f"{name}{when}_{share}_us": f"{getattr(spread, share):.0f}"
         for name, figure in figures.items()
         for when, spread in (("", figure.since_start), ("_minute", figure.last_minute))
         for share in ("p50", "p99", "max")
     }
-    level = WARN if missed > MAX_MISSED_FRACTION * (run_count + missed) else OK
-    return Row(
-        "control loop",
-        level,
-        f"{missed} of {run_count + missed} periods missed in the last minute",
-        values | _counted(counters, "missed") | _counted(counters, "bus"),
-        BUSY_ADVICE if level else "",
-    )
+    code: Code = "periods_missed" if missed > MAX_MISSED_FRACTION * periods else "periods_run"
+    why = reason(code, missed=missed, periods=periods, busy=BUSY_ADVICE)
+    values |= _counted(counters, "missed") | _counted(counters, "bus")
+    return Row("control loop", [why], values)
 
 
-def _commands(snapshot: Snapshot) -> Row:
+def _commands(config: Config, snapshot: Snapshot) -> Row:
+    timeouts = {source.name: source.timeout for source in config.commands.sources}
     values = {s.name: waiting(s.waits_for).text or "driving" for s in snapshot.sources}
     values |= _counted(snapshot.state.counters, "command")
     driver = snapshot.state.source
-    findings = [(OK, f"commanded by {driver}" if driver else "waiting for a command", "")]
+    findings = [reason("commanded", source=driver) if driver else NO_COMMAND]
     if snapshot.state.speed_limit:
-        findings.append((OK, f"speed limit: {snapshot.state.speed_limit}", ""))
+        findings.append(reason("speed_limited", limit=snapshot.state.speed_limit))
     for source in snapshot.sources:
         if source.waits_for.what == "senders":
-            text = (
-                f"{source.waits_for.senders + 1} programs send as {source.name}, and the robot "
-                "follows one of them"
+            senders = source.waits_for.senders + 1
+            findings.append(reason("shared_source", senders=senders, source=source.name))
+        timeout = timeouts.get(source.name, source.longest_gap_s)
+        if source.longest_gap_s > timeout:
+            gap_s = source.longest_gap_s
+            findings.append(
+                reason("command_gaps", source=source.name, seconds=gap_s, timeout=timeout)
             )
-            advice = "end the other programs, or give each program its own source"
-            findings.append((WARN, text, advice))
+        if source.waits_for.what == "neutral" and source.waits_for.lasts and source.twist:
+            twist = source.twist
+            findings.append(
+                reason(
+                    "never_zero",
+                    source=source.name,
+                    linear=twist.linear,
+                    angular=twist.angular,
+                )
+            )
     age_s = snapshot.refused_age_s
     if age_s is not None and age_s < SHOW_REFUSAL_S:
-        findings.append((WARN, f"refused: {snapshot.state.refused}", ""))
-    return _row("commands", findings, values)
+        findings.append(reason("refused", refused=snapshot.state.refused))
+    return Row("commands", findings, values)
 
 
 def _wheels(config: Config, snapshot: Snapshot) -> Row:
     text, counters = snapshot.state.wheel_fault, snapshot.state.counters
-    advice = _check(config)
-    if not config.feedback.encoders:
-        advice = "if the robot has encoders, set feedback.encoders = true"
     values = {
         "left_out": ", ".join(snapshot.excluded),
         "slipping": ", ".join(snapshot.slipping),
     }
     values |= _counted(counters, "wheel_fault") | _counted(counters, "uncommanded_motion")
-    if not text:
-        return Row("wheels", OK, "every wheel obeys its command", values)
-    return Row("wheels", WARN, text, values, advice)
+    code: Code = "wheel_fault" if config.feedback.encoders else "no_encoders"
+    why = reason(code if text else "wheels_obey", fault=text, check=_check(config))
+    return Row("wheels", [why], values)
 
 
 def _board(config: Config, snapshot: Snapshot) -> list[Row]:
-    safety, state = config.safety, snapshot.state
+    safety, state, check = config.safety, snapshot.state, _check(config)
     required = safety.estop == "required"
     if not (snapshot.board or required or safety.needs_bumpers):
         return []
-    findings = [BOARD[state.emergency_stop]]
+    findings = [ESTOP[state.emergency_stop]]
     if required and not state.emergency_stop:
-        findings = [(ERROR, MISSING_REASON.text, _check(config))]
+        findings = [replace(MISSING_REASON, advice=check)]
     if snapshot.bumper is not None:
-        level = ERROR if snapshot.bumper.code == "bumpers_silent" else WARN
-        findings.append((level, snapshot.bumper.text, snapshot.bumper.advice))
+        findings.append(snapshot.bumper)
     elif state.bumpers is not None:
-        findings.append((OK, f"{many(len(state.bumpers), 'bumper')} released", ""))
+        findings.append(reason("bumpers_released", bumpers=many(len(state.bumpers), "bumper")))
     elif safety.needs_bumpers:
-        findings.append((ERROR, missing_reason(safety).text, _check(config)))
+        findings.append(replace(missing_reason(safety), advice=check))
     if snapshot.board.get("motor_driver") == "fault":
-        findings.append((ERROR, DRIVER_FAULT_REASON.text, DRIVER_FAULT_REASON.advice))
+        findings.append(DRIVER_FAULT_REASON)
     counted: dict[str, str] = {}
     for kind in ("line_status", "emergency", "bumper"):
         counted |= _counted(snapshot.state.counters, kind)
-    return [_row("board", findings, snapshot.board | counted)]
+    return [Row("board", findings, snapshot.board | counted)]
 
 
 def _battery(config: Config, snapshot: Snapshot) -> list[Row]:
-    status, bounds = snapshot.battery, config.battery.bounds
+    status, bounds, check = snapshot.battery, config.battery.bounds, _check(config)
     if status is None:
-        missing = Row("battery", WARN, battery.MISSING_REASON, {}, _check(config))
-        return [missing] if bounds else []
+        missing = reason("battery_missing", text=battery.MISSING_REASON, check=check)
+        return [Row("battery", [missing], {})] if bounds else []
     values: dict[str, str] = {"level": status.level}
     numbers = {
         "volts": status.volts,
@@ -323,14 +300,13 @@ def _battery(config: Config, snapshot: Snapshot) -> list[Row]:
     }
     values |= {name: f"{value:.2f}" for name, value in numbers.items() if value is not None}
     values |= {f"{level}_below": f"{below:g}" for level, below in bounds.items()}
-    advice = {
-        "ok": "",
-        "warning": "charge the battery",
-        "stop": f"{battery.empty_reason(config.battery).advice}, {CLEAR}",
-        "unknown": _check(config),
-    }
-    text, level = battery.status_text(config.battery, status), status.level
-    return [Row("battery", BATTERY_LEVELS[level], text, values, advice[level])]
+    text = battery.status_text(config.battery, status)
+    if status.level == "stop":
+        empty = battery.empty_reason(config.battery)
+        why = replace(empty, text=text, advice=f"{empty.advice}, {CLEAR}")
+    else:
+        why = reason(BATTERY[status.level], text=text, check=check)
+    return [Row("battery", [why], values)]
 
 
 def _gyro(snapshot: Snapshot) -> list[Row]:
@@ -339,62 +315,48 @@ def _gyro(snapshot: Snapshot) -> list[Row]:
         return []
     values = {} if bias is None else {"bias_rad_s": f"{bias:.5f}"}
     values |= _counted(snapshot.state.counters, "imu_")
-    advice = GYRO_ADVICE.get(does, "")
-    return [Row("gyro", WARN if advice else OK, STATUS_TEXTS[does], values, advice)]
+    return [Row("gyro", [STATUS[does]], values)]
 
 
 def _routers(endpoints: Sequence[str], routers: RoutersStatus) -> list[Row]:
     missing, peers = routers.missing, routers.peers
     values = dict.fromkeys(endpoints, NOT_YET) | dict.fromkeys(routers.connected, "connected")
     values |= dict.fromkeys(missing, "not connected") | dict.fromkeys(peers, NO_ROUTER)
-    words = NOT_YET if NOT_YET in values.values() else "connected"
-    advice = ""
+    if not values:
+        return []
+    findings = [reason("routers_due" if NOT_YET in values.values() else "routers_connected")]
     if missing:
-        words = f"not connected to {', '.join(missing)}"
-        advice = (
-            "start the Zenoh router at that address (rmw_zenohd, zenohd or `acsard router`): the "
-            "daemon then connects by itself"
-        )
+        findings = [reason("router_missing", routers=", ".join(missing))]
     if peers:
-        advice = "connect all robots to a Zenoh router (page howto/fleet of the manual)"
-        words += (
-            f"; {', '.join(peers)} is not a router: clients that connect to this daemon see only "
-            "this robot"
-        )
-    level = WARN if missing or peers else OK
-    return [Row("router", level, words, values, advice)] if values else []
+        findings.append(reason("router_is_peer", routers=", ".join(peers)))
+    return [Row("router", findings, values)]
 
 
 def _recording(recording: Recording) -> list[Row]:
     if not recording.where:
         return []
-    missing = {"steps_missing": str(recording.missing)}
-    if not recording.trouble:
-        return [Row("recording", OK, "on", missing)]
-    advice = "free disk space, or set record.directory to a writable directory"
-    return [Row("recording", WARN, recording.trouble, missing, advice)]
+    why = reason("recording_works")
+    if recording.trouble:
+        why = reason("recording_fails", trouble=recording.trouble)
+    return [Row("recording", [why], {"steps_missing": str(recording.missing)})]
 
 
-def _certificate(code: str, text: str) -> list[Row]:
-    if not code:
-        return []
-    level = CERTIFICATE_LEVELS[code]
-    advice = "run `acsard doctor` on the daemon's machine, where it examines the certificate files"
-    return [Row("certificate", level, text, {}, advice if level else "")]
+def _certificate(why: Reason | None) -> list[Row]:
+    return [] if why is None else [Row("certificate", [why], {})]
 
 
 def _latch_file(trouble: str | None) -> list[Row]:
     if trouble is None:
         return []
-    if not trouble:
-        return [Row("latch file", OK, "written", {})]
-    advice = "free disk space, or set control.state_directory to a writable directory"
-    return [Row("latch file", WARN, trouble, {}, advice)]
+    why = reason("latch_file_works")
+    if trouble:
+        why = reason("latch_file_fails", trouble=trouble)
+    return [Row("latch file", [why], {})]
 
 
 def _settings(differ: str) -> Row:
-    changed = f"changed since the daemon's start: {differ}" if differ else "those of the start"
-    return Row("settings", OK, changed, {})
+    why = reason("settings_changed", differ=differ) if differ else reason("settings_same")
+    return Row("settings", [why], {})
 
 
 def _counted(counters: dict[str, int], kind: str) -> dict[str, str]:

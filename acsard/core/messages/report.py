@@ -11,8 +11,9 @@ from functools import partial
 
 from msgspec.structs import replace
 
+from acsard.core.codes import Reason
 from acsard.core.config.settings import DIAGNOSTICS_HZ, STATE_HZ, Config
-from acsard.core.messages.certificate_expiry import DAY_NS, expiry, first_expiry
+from acsard.core.messages.certificate_expiry import DAY_NS, expiry, first_expiry, short_code
 from acsard.core.messages.diagnostics import diagnostics
 from acsard.core.messages.frames import (
     FeedbackTopic,
@@ -301,12 +302,12 @@ class Report:
         return TwistStamped(header, _twist(applied))
 
     def _state(self, now: Instant, snapshot: Snapshot) -> RobotState:
-        certificate, expiry_text = self._certificate(now)
+        certificate = self._certificate(now)
         return replace(
             snapshot.state,
             stamp=Time.from_ns(now.wall_ns),
-            certificate=certificate,
-            certificate_expiry=expiry_text,
+            certificate=short_code(certificate) if certificate else "",
+            certificate_expiry=certificate.text if certificate else "",
             certificate_days=self._certificate_days(now),
             version=self._version,
         )
@@ -335,10 +336,10 @@ class Report:
             present=battery.reported_ns is not None,
         )
 
-    def _certificate(self, now: Instant) -> tuple[str, str]:
+    def _certificate(self, now: Instant) -> Reason | None:
         bus = self._config.bus
         if not bus.tls or not (self.certificate_ends or bus.uses_tls):
-            return "", ""
+            return None
         return expiry(self.certificate_ends, now.wall_ns)
 
     def _diagnostics(self, now: Instant, snapshot: Snapshot) -> DiagnosticArray:

@@ -14,11 +14,13 @@ from typing import Annotated, get_args
 
 from msgspec import Meta, Struct, field
 
-from acsard.core.codes import Code, PoseCode, StateCode, WaitCode, received_text
+from acsard.core.codes import Code, StateCode, received_text
 from acsard.core.link.link_state import LinkState
-from acsard.core.messages.certificate_expiry import CertificateCode
+from acsard.core.messages.certificate_expiry import Expiry
 from acsard.core.messages.keys_and_roles import Direction
 from acsard.core.motion.modes import Mode
+from acsard.core.tables.pose_codes import PoseCode
+from acsard.core.tables.sender_codes import WaitCode
 from acsard.core.values import (
     NS_PER_S,
     ROLES,
@@ -348,6 +350,16 @@ class SourceState(Message, frozen=True):
     - higher, equal: a source of higher or of the same priority controls the robot.
     - senders: other senders of this source wait until the sender that drives falls silent.
     """
+    linear: float | None = None
+    """Forward speed in the last accepted command, m/s; null like `age`."""
+    angular: float | None = None
+    """Turn rate in the last accepted command, rad/s; null like `age`."""
+    longest_gap: float = 0.0
+    """Longest time between a speed and the next command of its sender in the last 30 to 60 s, s.
+
+    In a gap above the timeout of the source the robot has braked. A gap above 5 s is the end of a
+    drive, and does not count.
+    """
 
 
 class Spread(Message, frozen=True):
@@ -498,7 +510,7 @@ class RobotState(Message, frozen=True):
 
     It is negative after this time. It is null without TLS, or while the time is unknown.
     """
-    certificate: Annotated[str, one_of(("", *get_args(CertificateCode)))] = ""
+    certificate: Annotated[str, one_of(("", *get_args(Expiry)))] = ""
     """Whether the TLS certificates of the bus are valid; empty without TLS.
 
     - valid: at least 30 days remain.

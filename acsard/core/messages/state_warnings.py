@@ -6,14 +6,14 @@ All tools show them in these words; programs read the fields of `state`.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from typing import Literal, get_args
+from typing import Literal, cast, get_args
 
 from msgspec import Struct
 
-from acsard.core.codes import CODES
+from acsard.core.codes import CODES, Code, joined, level_of, reason
 from acsard.core.formatting import printable
-from acsard.core.messages.certificate_expiry import CERTIFICATE_LEVELS
 from acsard.core.messages.schema import BatterySummary, RobotState
+from acsard.core.tables.pose_codes import PoseCode
 
 What = Literal[
     "emergency_stop", "bumper", "battery", "certificate", "recording", "latch_file", "wheel",
@@ -24,31 +24,21 @@ WARNING_KINDS: tuple[What, ...] = get_args(What)  # most urgent first
 
 WARNING = "WARNING"  # begins a list of warnings
 
-ESTOP = {"pressed": "emergency stop pressed", "silent": "emergency stop not reported"}
-
-# Words by level.
-BATTERY = {
-    "warning": "battery low",
-    "stop": "battery empty",
-    "unknown": "battery level unknown",
+# Codes of the levels of the battery that warn.
+BATTERY: dict[str, Code] = {
+    "warning": "battery_low",
+    "stop": "battery_empty",
+    "unknown": "battery_unknown",
 }
 
-
-# Warnings that only repeat the reason, by its code.
-SAME_AS_REASON: dict[str, What] = {
-    "emergency_stop": "emergency_stop",
-    "emergency_stop_silent": "emergency_stop",
-    "bumper": "bumper",
-    "bumpers_silent": "bumper",
-    "bumper_away": "bumper",
-    "bumper_blocks": "bumper",
-}
+ESTOP: dict[str, Code] = {"pressed": "emergency_stop", "silent": "emergency_stop_silent"}
 
 
 class StateWarning(Struct, frozen=True):
     """A warning about a part of the robot, `what`."""
 
     what: What
+    code: str
     brief: str  # for a column of a table
     text: str = ""  # details
 
@@ -59,6 +49,11 @@ class StateWarning(Struct, frozen=True):
 def warnings(state: RobotState) -> list[StateWarning]:
     """Return the warnings about the robot with this `state`, the most urgent first."""
     return list(_warnings(state))
+
+
+def beside_reason(state: RobotState) -> list[StateWarning]:
+    """Return the warnings that do not only repeat the reason, by its code."""
+    return [why for why in _warnings(state) if not state.code.startswith(why.code)]
 
 
 def brief(state_warnings: Sequence[StateWarning]) -> str:
@@ -77,23 +72,27 @@ def charge(battery: BatterySummary | None) -> str:
 
 
 def _warnings(state: RobotState) -> Iterator[StateWarning]:
-    if state.emergency_stop in ESTOP:
-        yield StateWarning("emergency_stop", ESTOP[state.emergency_stop])
+    if code := ESTOP.get(state.emergency_stop):
+        yield _warning("emergency_stop", code)
     if pressed := [str(n) for n, bumper in enumerate(state.bumpers or (), 1) if bumper]:
         noun = "bumpers" if len(pressed) > 1 else "bumper"
-        yield StateWarning("bumper", f"{noun} {' and '.join(pressed)} pressed")
-    if state.battery is not None and state.battery.level in BATTERY:
+        yield StateWarning("bumper", "bumper", f"{noun} {' and '.join(pressed)} pressed")
+    if state.battery is not None and (code := BATTERY.get(state.battery.level)):
         battery = charge(state.battery)
-        words = BATTERY[state.battery.level]
-        yield StateWarning("battery", f"{words} ({battery})" if battery else words)
-    if CERTIFICATE_LEVELS.get(state.certificate):
-        yield StateWarning("certificate", f"certificate {state.certificate_expiry}")
+        words = CODES[code].figure
+        yield StateWarning("battery", code, f"{words} ({battery})" if battery else words)
+    if state.certificate and level_of(why := f"certificate_{state.certificate}") != "ok":
+        yield StateWarning("certificate", why, f"certificate {state.certificate_expiry}")
     if state.recording_error:
-        yield StateWarning("recording", "recording fails", state.recording_error)
+        yield _warning("recording", "recording_fails", state.recording_error)
     if state.latch_file_error:
-        yield StateWarning("latch_file", "latch file fails", state.latch_file_error)
+        yield _warning("latch_file", "latch_file_fails", state.latch_file_error)
     if state.wheel_fault:
-        yield StateWarning("wheel", "wheel fault", state.wheel_fault)
-    if warning := CODES.get(state.pose_doubt):
-        brief = "not calibrated" if state.pose_doubt == "not_calibrated" else "pose doubtful"
-        yield StateWarning("pose", brief, f"{warning.text} {warning.advice}")
+        yield _warning("wheel", "wheel_fault", state.wheel_fault)
+    if state.pose_doubt in CODES:
+        doubt = reason(cast("PoseCode", state.pose_doubt))
+        yield _warning("pose", doubt.code, joined(doubt).text)
+
+
+def _warning(what: What, code: Code, text: str = "") -> StateWarning:
+    return StateWarning(what, code, CODES[code].figure, text)

@@ -14,7 +14,7 @@ from typing import Literal
 
 from msgspec import Struct
 
-from acsard.core.codes import AgeCode
+from acsard.core.tables.sender_codes import AgeCode
 from acsard.core.values import NS_PER_S, Command, Ns
 
 AgeVerdict = Literal[AgeCode, ""]

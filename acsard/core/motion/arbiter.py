@@ -13,7 +13,6 @@ import math
 
 from msgspec import Struct, field
 
-from acsard.core.codes import AgeCode
 from acsard.core.config.settings import CommandsConfig, Source
 from acsard.core.link.step_times import CATCH_UP_NS
 from acsard.core.motion.ages import MARGIN_NS, MAX_CLOCKS, SILENT_NS, Ages, Order
@@ -26,6 +25,7 @@ from acsard.core.motion.neutral import (
     Sender,
     is_zero,
 )
+from acsard.core.tables.sender_codes import AgeCode
 from acsard.core.values import (
     BRIDGES,
     NS_PER_S,
@@ -41,6 +41,10 @@ from acsard.core.values import (
 MAX_SENDERS = 16  # of a source; one that may drive is never replaced
 
 LASTING_NS = 3 * NS_PER_S  # of zeros only, or of speeds without being armed, until `state` says so
+
+# A longer gap behind a speed is the end of a drive. The longest gap is of the last one or two
+# windows.
+LONGEST_GAP_NS, GAP_WINDOW_NS = 5 * NS_PER_S, 30 * NS_PER_S
 
 NOTHING, COMMAND = Wait("nothing"), Wait("command")
 
@@ -70,6 +74,25 @@ class SourceSenders(Struct):
     forgot_ns: Ns = 0  # last message of a sender that was replaced, or that never had a place
     # Since when the token of a sender is there; of all bridges, since the last change.
     announced: dict[str, Ns] = {}
+    # Longest times between a speed and the next command, now and before, and since when.
+    gap_ns: Ns = 0
+    gap_before_ns: Ns = 0
+    gaps_since_ns: Ns = 0
+
+    def note_gap(self, gap_ns: Ns, now_ns: Ns) -> None:
+        """Note the time between a speed of a sender and its next command."""
+        if now_ns - self.gaps_since_ns > GAP_WINDOW_NS:
+            self.gap_before_ns, self.gap_ns, self.gaps_since_ns = self.longest_ns(now_ns), 0, now_ns
+        if gap_ns <= LONGEST_GAP_NS:
+            self.gap_ns = max(self.gap_ns, gap_ns)
+
+    def longest_ns(self, now_ns: Ns) -> Ns:
+        """Return the longest gap of the last window or two, 0 without commands."""
+        if now_ns - self.gaps_since_ns > 2 * GAP_WINDOW_NS:
+            return 0
+        if now_ns - self.gaps_since_ns > GAP_WINDOW_NS:
+            return self.gap_ns
+        return max(self.gap_ns, self.gap_before_ns)
 
     def add(self, name: str, now_ns: Ns, timeout_ns: Ns) -> Sender | None:
         """Return a new sender (it may replace another one), or None."""
@@ -206,6 +229,8 @@ class Arbiter(Struct):
         ):
             # Only the time of the sender that drives is newer, so the choice holds even longer.
             self.until_ns = until_ns
+        if sender.arrived_ns is not None and sender.twist != REST:
+            source.note_gap(now_ns - sender.arrived_ns, now_ns)
         sender.take(command, timeout)
         if sender.hint is not None:
             _accept_hint(sender, command, source.ages, timeout, waits=waits)
@@ -268,7 +293,7 @@ class Arbiter(Struct):
         armed = sender.is_armed(now_ns)
         self.holder = settings.name, name if armed else ""
         if not (armed and sender.is_live(now_ns, timeout_ns(settings))):
-            return Choice(settings.name, None, _wait(sender, settings, now_ns, True), name)
+            return Choice(settings.name, None, _wait(sender, settings, now_ns), name)
         self.follows = True
         wait, since_ns = NOTHING, sender.zeros_ns
         if since_ns is not None and now_ns - since_ns >= LASTING_NS:
@@ -308,11 +333,19 @@ class Arbiter(Struct):
         return tuple(self._status(settings, now_ns, commands) for settings in ranking(commands))
 
     def _status(self, settings: Source, now_ns: Ns, commands: CommandsConfig) -> SourceStatus:
-        senders = self.sources.get(settings.name, SourceSenders()).senders.values()
-        latest_ns = max((s.arrived_ns for s in senders if s.arrived_ns is not None), default=None)
-        age_s = None if latest_ns is None else max(0, now_ns - latest_ns) / NS_PER_S
-        wait = self._waits_for(settings, now_ns, commands)
-        return SourceStatus(settings.name, settings.priority, age_s, wait)
+        source = self.sources.get(settings.name, SourceSenders())
+        came = [
+            (s.arrived_ns, s.twist) for s in source.senders.values() if s.arrived_ns is not None
+        ]
+        latest_ns, twist = max(came, key=lambda pair: pair[0], default=(None, None))
+        return SourceStatus(
+            settings.name,
+            settings.priority,
+            None if latest_ns is None else max(0, now_ns - latest_ns) / NS_PER_S,
+            self._waits_for(settings, now_ns, commands),
+            twist,
+            source.longest_ns(now_ns) / NS_PER_S,
+        )
 
     def _waits_for(self, settings: Source, now_ns: Ns, commands: CommandsConfig) -> Wait:
         present, (holder, name) = self._present(settings, now_ns), self.holder
@@ -323,7 +356,7 @@ class Arbiter(Struct):
             present.values(), key=lambda each: (not each.is_armed(now_ns), each.came_ns)
         )
         if not (first.is_armed(now_ns) and first.is_live(now_ns, timeout_ns(settings))):
-            return _wait(first, settings, now_ns, False)
+            return _wait(first, settings, now_ns)
         if holder in ("", settings.name):
             return Wait("senders", senders=len(present) - 1) if len(present) > 1 else NOTHING
         equal = any(s.name == holder and s.priority == settings.priority for s in commands.sources)
@@ -371,11 +404,11 @@ def _refusal(
     return Wait(verdict, settings.name, seconds, kept=note)
 
 
-def _wait(sender: Sender, settings: Source, now_ns: Ns, lasting: bool) -> Wait:
-    # Why a sender that takes part in the choice does not drive; `lasting`: for how long it tries.
+def _wait(sender: Sender, settings: Source, now_ns: Ns) -> Wait:
+    # Why a sender that takes part in the choice does not drive.
     if not sender.is_live(now_ns, timeout_ns(settings)):
         return sender.refused or Wait("stalled", settings.name)
-    since_ns = sender.speeds_ns if lasting else None
+    since_ns = sender.speeds_ns
     return Wait(
         "neutral",
         settings.name,

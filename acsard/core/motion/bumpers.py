@@ -105,7 +105,7 @@ class Bumpers(BoardInput):
 
     def pressed_reason(self, safety: SafetyConfig) -> Reason:
         words = pressed_words(safety.bumpers, self.pressed or ())
-        return reason("bumper", part=words, bumpers=words)
+        return reason("bumper", words, bumpers=words)
 
     def advice(self, why: Reason, safety: SafetyConfig) -> str:
         if self.limiting(safety):

@@ -9,10 +9,13 @@ becomes uncertainty of the heading, because wheels may slip.
 from __future__ import annotations
 
 import math
+from typing import cast, get_args
 
 from msgspec import Struct, field
 
+from acsard.core.codes import Reason, joined, reason
 from acsard.core.motion.agreement import MARGIN, MAX_DELAY_S, Agreement, Claims, Compared
+from acsard.core.tables.pose_codes import GyroCode
 from acsard.core.values import (
     NS_PER_S,
     Event,
@@ -55,27 +58,15 @@ MAX_JUMP, CONFIRMED = 0.5, 0.5
 # this share of its samples, so that such a series has less than this probability.
 HANG_S, MAX_REPEATING, MIN_CHANCE = 0.5, 0.6, 1e-6
 
-STATUS_TEXTS: dict[GyroDoes, str] = {
-    "off": "",
-    "waiting for rest": "the gyro's bias is not known yet: the robot must stand for "
-    f"{REST_S + LEARNING_TIME_S:.1f} s, in which the gyro reports {LEARNING_SAMPLES} rates of at "
-    f"most {MAX_BIAS} rad/s",
-    "waiting for turn": "the heading comes from the wheels until the gyro has agreed with them in "
-    "a turn",
-    "used": "the heading comes from the gyro",
-    "silent": "the gyro is silent: the heading comes from the wheels",
-    "hangs": "the gyro repeats one rate exactly, so it hangs: the heading comes from the wheels",
-    "disagrees": "gyro and wheels measure different turns: the heading is the gyro's, and its "
-    "uncertainty includes the difference. Do the wheels slip, has the gyro's scale or bias "
-    "changed? If the track is not calibrated, run acsard calibrate",
-    "reversed": "the gyro is not used, because it reports a left turn of the robot as a right "
-    "turn: check how the gyro is mounted",
-    "in degrees": "the gyro is not used, because its rate is 57 times too high: it sends degrees "
-    "per second, and must send radians per second",
-    "dead": "the gyro is not used, because it measures no turn while the wheels turn the robot: "
-    "check the gyro",
-    "not believed": "the gyro is not used, because it measures much larger turns than the wheels: "
-    "does its z axis point up, does it send rad/s, and has its bias changed?",
+STATUS: dict[GyroDoes, Reason] = {
+    does: reason(
+        cast("GyroCode", f"gyro_{does.replace(' ', '_')}"),
+        seconds=REST_S + LEARNING_TIME_S,
+        samples=LEARNING_SAMPLES,
+        most=MAX_BIAS,
+    )
+    for does in get_args(GyroDoes)
+    if does != "off"
 }
 
 
@@ -187,11 +178,11 @@ class Gyro(Struct):
         before, does = self.reported, self.does
         self.reported = does
         # The text of "waiting for turn" announces the change to "used".
-        if does == before or (before, does) == ("waiting for turn", "used"):
+        if does in (before, "off") or (before, does) == ("waiting for turn", "used"):
             return None
-        good = does in ("used", "waiting for rest", "waiting for turn")
-        level: Level = "info" if good else "warning"
-        return Event("gyro", STATUS_TEXTS[does], level, kind=does)
+        why = STATUS[does]
+        level: Level = "info" if why.level == "ok" else "warning"
+        return Event("gyro", joined(why).text, level, kind=does, code=why.code)
 
     def forget_doubt(self) -> None:
         """Forget the uncertainty of turns before now: a new pose was set."""

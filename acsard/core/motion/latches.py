@@ -6,8 +6,9 @@ from collections.abc import Collection, Sequence
 
 from msgspec.structs import replace
 
-from acsard.core.codes import Reason, StopCode, reason
+from acsard.core.codes import Reason, reason
 from acsard.core.formatting import utc
+from acsard.core.tables.stop_codes import StopCode
 from acsard.core.values import Cause, CauseKind, Latches, WallNs
 
 # A flood of stops by many clients must not fill the memory, and no stop may be forgotten. The last

@@ -411,7 +411,7 @@ class Wheels(Struct):
             f"(commanded {one.command:.2f} and {other.command:.2f}, "
             f"measured {one.speed:.2f} and {other.speed:.2f} rad/s)"
         )
-        self.fault = joined(reason("wheels_swapped", part=names, wheels=names, figures=figures))
+        self.fault = joined(reason("wheels_swapped", names, wheels=names, figures=figures))
         one.forget()
         other.forget()
         return True
@@ -420,7 +420,7 @@ class Wheels(Struct):
         wheel, name = self.wheels[i], self.names[i]
         if self.fault is None:
             figures = f"(commanded {command:.2f}, measured {wheel.speed:.2f} rad/s)"
-            self.fault = joined(reason(code, part=name, wheel=name, figures=figures))
+            self.fault = joined(reason(code, name, wheel=name, figures=figures))
         wheel.latched = True
         wheel.forget()
 

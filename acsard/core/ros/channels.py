@@ -84,7 +84,7 @@ rcl_interfaces/msg/Log: \
     string file, string function, uint32 line
 acsard/msg/Counter: string name, int64 count
 acsard/msg/SourceState: string name, int64 priority, float64 age, string waits_for, \
-    string wait
+    string wait, float64 linear, float64 angular, float64 longest_gap
 acsard/msg/RobotState: \
     std_msgs/msg/Header header, string mode, string code, string reason, \
     float64 x, float64 y, float64 yaw, float64 linear, float64 angular, float64[] wheels, \

@@ -15,10 +15,11 @@ from contextlib import suppress
 import serial
 from serial.serialposix import BOTHER, TCGETS2, TCSETS2
 
+from acsard.core.codes import reason
 from acsard.core.values import Ns
 from acsard.host import clock
 from acsard.host.errors import InUseError, MendableError, NoPortError, NotPermittedError
-from acsard.host.port_access import GETTY, WITHOUT_DEVICE, console_advice, denial
+from acsard.host.port_access import GETTY, console_advice, denial
 from acsard.host.processes import Holder, holder_of, is_check_here
 from acsard.host.threads import NoThreadError, begin
 
@@ -195,7 +196,7 @@ def refusal(path: str, error: OSError) -> MendableError:
     match error.errno:
         case errno.ENOENT | errno.ENODEV | errno.ENXIO | errno.ENOTDIR:
             if os.path.exists(path):
-                return NoPortError(f"{path} {WITHOUT_DEVICE} ({_LISTED})")
+                return NoPortError(f"{reason('port_orphan', path=path).text} ({_LISTED})")
             return NoPortError(
                 f"{path} does not exist; plug the device in, or name another port ({_LISTED})"
             )

@@ -1,0 +1,60 @@
+"""The form of a table of findings: `code -> (level, text, advice)`.
+
+An entry begins with `LEVEL code`, or with `LEVEL subject: outcome` for the code `subject_outcome`,
+and maybe ` | figure`: a few words for a column, or the measured values. Its text follows, and
+behind `->` the advice: what a person can do. All three are format strings.
+"""
+
+from __future__ import annotations
+
+import re
+from typing import Literal, get_args
+
+from msgspec import Struct
+
+Level = Literal["ok", "warning", "failure"]
+# Mild to severe; the index is the number in ROS diagnostics.
+LEVELS: tuple[Level, ...] = ("ok", "warning", "failure")
+
+_LEVEL_OF: dict[str, Level] = {
+    "OK": "ok", "PASS": "ok", "SKIPPED": "ok", "WARN": "warning", "FAIL": "failure",
+}  # fmt: skip
+
+
+class Entry(Struct, frozen=True):
+    """The texts of a code, "" if it has none.
+
+    `mark` is the first word of its head, and `subject` what it is about. `unsure` says whether a
+    computer that runs a check too late can cause this outcome: a "?" behind the mark.
+    """
+
+    level: Level
+    mark: str
+    unsure: bool
+    subject: str
+    figure: str
+    text: str
+    advice: str
+
+
+def code_of(name: str) -> str:
+    """Return the code of an entry, such as "port_missing" for "port: missing"."""
+    return re.sub(r"\W+", "_", name).lower()
+
+
+def table(codes: object, text: str) -> dict[str, Entry]:
+    """Return the entries by code. `codes` is their `Literal`, or None. Raises `ValueError`."""
+    entries = {}
+    for entry in re.split(r"\n+(?! )", text.strip()):
+        head, *rest = entry.splitlines()
+        mark, _, head = head.partition(" ")
+        name, _, figure = head.partition(" | ")
+        subject = name.partition(":")[0]
+        words, _, advice = " ".join(line.strip() for line in rest).partition("-> ")
+        level = _LEVEL_OF[mark.rstrip("?")]
+        entries[code_of(name)] = Entry(
+            level, mark.rstrip("?"), mark.endswith("?"), subject, figure, words.strip(), advice
+        )
+    if codes is not None and (wrong := set(get_args(codes)) ^ entries.keys()):
+        raise ValueError(f"of these, a type or a table of codes lacks: {sorted(wrong)}")
+    return entries
