@@ -257,6 +257,7 @@ static void show_level(struct line line, bool level)
         return;
     /* or writing the pull-ups would set all pins */
     port->external.pull_value = (uint8_t)((port->external.pull_value & ~mask) | (level ? mask : 0));
+    avr->data[pin_register(line.port)] ^= mask; /* after a reset the next line alone would not do it */
     avr_raise_irq(avr_io_getirq(avr, AVR_IOCTL_IOPORT_GETIRQ(line.port), line.bit), level);
     if (line.port == 'K' && avr->data[PCMSK2] & mask)
         avr_raise_interrupt(avr, &pin_change);
