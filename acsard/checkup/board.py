@@ -445,15 +445,15 @@ class Board:
     def stop_motors(self) -> None:
         """Send zeros until all motors stand still.
 
-        If a motor does not stop in time, also send zeros with the other line ending. If motor d
-        alone had kept its speed, and stops now, use that ending from now on. Raises `StoppedError`
-        if a motor keeps turning, or if the board falls silent.
+        If a motor does not stop in time, also send zeros with the other line ending. If the last
+        motor alone had kept its speed, and stops now, use that ending from now on. Raises
+        `StoppedError` if a motor keeps turning, or if the board falls silent.
         """
         began_s = self.now_s
         if self.settles(self.comma):
             return
         turning = motion.turning(self.replies, self.now_s)
-        runs_on = turning == [3] and not self._slows()
+        runs_on = turning == [len(self.letters) - 1] and not self._slows()
         silent = self._unheard_s(began_s) > self._max_silence_s
         if self.settles(not self.comma):
             if runs_on:

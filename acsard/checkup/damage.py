@@ -6,8 +6,9 @@ from collections.abc import Sequence
 
 from acsard.checkup import outcomes
 from acsard.checkup.board import Board
-from acsard.checkup.findings import Finding
-from acsard.checkup.motion import SHORT_MEASUREMENT_S, moving
+from acsard.checkup.findings import Finding, motor_names
+from acsard.checkup.motion import SHORT_MEASUREMENT_S, SPEED, moving
+from acsard.checkup.motor_channels import run_up
 from acsard.core.config.wire_time import TOKEN_BYTES
 from acsard.core.link.checked_line import seal
 
@@ -53,10 +54,15 @@ def finding(board: Board, motors: Sequence[int]) -> Finding:
     """
     if not motors:
         return outcomes.find("damaged lines: untested")
-    lines = broken_lines(board, motors)
+    cut = f"{board.letters[motors[-1]]}n\r\n".encode()
+    lines = [*broken_lines(board, motors), ("cut behind a sign", cut)]
     # A coarse encoder may report an earlier movement only now.
     board.drive(board.zero, SHORT_MEASUREMENT_S)
     took = dict.fromkeys(what for what, line in lines if _moves(board, line))
+    speeds = run_up(board, board.only(motors))
+    board.stop_motors()
+    if names := motor_names(board.mcu, [m for m in motors if speeds[m] < SPEED / 3], ", "):
+        return outcomes.find("damaged lines: inverted", names=names)
     if not took:
         return outcomes.find("damaged lines: right", lines=len(lines))
     outcome = "lenient" if took.keys() <= HARMLESS_KINDS else "taken"

@@ -39,13 +39,14 @@ Kind = Literal[
     "other",  # only the encoder of another motor moved
     "several",  # several encoders moved, or different ones forward and backward
     "one way",  # encoders moved in only one of the two directions
+    "last edge",  # its speed never passed through zero when it was reversed
     "no sign",  # its own encoder reported one direction for both
     "size",  # the error of the speed is larger than `FAIL_TOLERANCE`
     "off",  # the error of the speed is larger than `WARN_TOLERANCE`
     "late",  # this computer was too late to judge the motor
 ]
 # Only the motor's own encoder moves, in the right direction.
-FOLLOWING_KINDS: tuple[Kind, ...] = ("right", "off", "size")
+FOLLOWING_KINDS: tuple[Kind, ...] = ("right", "off", "size", "last edge")
 
 
 class Channel(Struct, frozen=True):
@@ -66,6 +67,8 @@ class Channel(Struct, frozen=True):
     probed: bool = False
     # Possible relative error of the measured speeds, because the encoder is coarse.
     unsure: float = 0.0
+    # Its reported speed jumped over zero at each of several reversals.
+    jumps: bool = False
     # False if this computer was too late, so that the other fields are doubtful.
     judged: bool = True
 
@@ -96,7 +99,9 @@ class Channel(Struct, frozen=True):
             return "no sign"
         if self.error > FAIL_TOLERANCE:
             return "size"
-        return "off" if self.error > WARN_TOLERANCE + self.unsure else "right"
+        if self.error > WARN_TOLERANCE + self.unsure:
+            return "off"
+        return "last edge" if self.jumps else "right"
 
     @property
     def turns(self) -> bool:
@@ -206,6 +211,11 @@ def wheel_map(mcu: McuConfig, channels: Sequence[Channel]) -> Finding:
 # not have reached its speed.
 REPEAT_FRACTION = 0.8
 
+# If the board reports more often, a wrong sign in one report is a movement of millimetres.
+LONG_GAP_S = 0.05
+
+REVERSALS = 6
+
 # Time over which the second, longer measurement of a speed averages the speed.
 LONG_MEASUREMENT_S = 0.75 * motion.MOTOR_TIMEOUT_S
 
@@ -240,6 +250,20 @@ def _unsure(board: Board, motor: int, seconds: float) -> float:
     # The ramp is over in the second half of the time.
     look = motion.since(board.replies, board.now_s - seconds / 2)
     return motion.grain_s(look, [motor]) / seconds
+
+
+def _jumps(board: Board, motor: int) -> bool:
+    # Some firmware gives all edges since its last report the direction of the last edge. A right
+    # report that is later than a reversal by some part of the time between reports shows almost
+    # no movement. So the reversals are spread over this time.
+    if board.gap_s < LONG_GAP_S:
+        return False
+    least = math.inf
+    for n in range(REVERSALS):
+        speeds = board.only([motor], motion.SPEED if n % 2 else -motion.SPEED)
+        replies = board.drive(speeds, (4 + n / REVERSALS) * board.gap_s)
+        least = min(least, *(abs(reply.motors[motor]) for reply in replies))
+    return least > motion.SPEED / 3
 
 
 def _look_s(board: Board) -> float:
@@ -305,10 +329,11 @@ def _both_ways(board: Board, motor: int) -> Channel:
         board.stop_motors()
         back, other = turn(board, motor, -motion.SPEED)
         unsure = max(unsure, other)
+    jumps = motor in moving(back) and _jumps(board, motor)
     if motor not in moving(back):
         board.stop_and_be_silent(motion.WATCHDOG_SILENCE_S)
     board.stop_motors()
-    return Channel(motor, forth, back, unsure=unsure)
+    return Channel(motor, forth, back, unsure=unsure, jumps=jumps)
 
 
 def probe(board: Board, motor: int) -> Motors | None:

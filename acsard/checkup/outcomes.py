@@ -162,6 +162,11 @@ FAIL? motor: several | {shown}
 FAIL? motor: one way | {figure}
     motor {here} shows movement in one direction only
     -> check the direction output of {here}'s driver, and A and B of its encoder
+WARN motor: last edge | {figure}
+    when motor {here} is reversed, its reported speed jumps over zero: the firmware gives all edges
+    of a report the direction of the last edge, or the motor reverses faster than the board reports.
+    Each reversal makes the pose wrong
+    -> count edges up and down by their direction, as the sketch of deploy/firmware does
 FAIL? motor: no sign | {figure}
     encoder {here} reports the same direction when motor {here} turns forward and backward
     -> is one of the two channels A and B of encoder {here} missing, or does the firmware lose the
@@ -275,7 +280,8 @@ FAIL? watchdog: weak
 FAIL watchdog: none | none within {seconds:.1f} s
     the motors run on when the computer is silent: with a pulled cable or a hung computer the
     robot drives on
-    -> the firmware must stop the motors 300 ms after the last valid line
+    -> do not put this robot on the floor: flash the sketch of deploy/firmware, or let your firmware
+    stop the motors 300 ms after the last valid line
 FAIL? watchdog: late | {figure}
     when the cable is pulled, the robot drives on for {seconds:.1f} s, which is {seconds:.1f} m at
     1 m/s
@@ -301,6 +307,11 @@ PASS? damaged lines: right | {lines} lines, no motor moved
 WARN damaged lines: lenient | {took} of {kinds} kinds obeyed
     motors followed broken lines: {which}
     -> the firmware should accept a line whole or not at all
+FAIL damaged lines: inverted | {names} reversed for good
+    a line that was cut behind its sign reversed this motor or these: {names}. Since then good
+    lines turn it backward or not at all, and a single lost byte can do that while the robot drives
+    -> do not put this robot on the floor: flash the sketch of deploy/firmware, or let your firmware
+    set the direction from the sign of each whole line, and never toggle it
 FAIL damaged lines: taken | {took} of {kinds} kinds obeyed
     motors followed broken lines: {which}; noise on a cable would drive the robot
     -> the firmware must accept a line whole or not at all, like deploy/firmware

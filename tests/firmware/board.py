@@ -80,34 +80,54 @@ def build_firmware(where: Path, *defines: str) -> Path:
     return where / "firmware.elf"
 
 
-ARDUINO_FLAGS = (
-    "-std=gnu++11", "-Os", "-mmcu=atmega2560", "-DF_CPU=16000000L", "-DARDUINO=10808",
-    "-DARDUINO_ARCH_AVR", f"-I{ARDUINO}/cores/arduino", f"-I{ARDUINO}/variants/mega",
-    "-ffunction-sections", "-fdata-sections", "-fno-exceptions", "-fno-threadsafe-statics",
-)  # fmt: skip
+class Chip(NamedTuple):
+    """A chip with a sketch: its name, the variant of the Arduino core, the runner's board."""
+
+    name: str
+    variant: str
+    board: str
 
 
-def build_core(where: Path) -> Path:
+MEGA = Chip("atmega2560", "mega", "mega")
+UNO = Chip("atmega328p", "standard", "uno")
+
+
+def arduino_flags(chip: Chip) -> list[str | Path]:
+    return [
+        "-std=gnu++11", "-Os", f"-mmcu={chip.name}", "-DF_CPU=16000000L", "-DARDUINO=10808",
+        "-DARDUINO_ARCH_AVR", f"-I{ARDUINO}/cores/arduino", f"-I{ARDUINO}/variants/{chip.variant}",
+        "-ffunction-sections", "-fdata-sections", "-fno-exceptions", "-fno-threadsafe-statics",
+    ]  # fmt: skip
+
+
+def build_core(where: Path, chip: Chip) -> Path:
     """Build the Arduino core, which each sketch is linked with. Return its library."""
     core = ARDUINO / "cores" / "arduino"
     # It warns, and expects a constant that the headers of Debian's older compiler lack.
     flags = ["-DDECIMAL_DIG=17", "-w", "-fpermissive"]
     parts = sorted([*core.glob("*.c"), *core.glob("*.cpp")])
-    _run(["avr-gcc", *ARDUINO_FLAGS, *flags, "-c", *parts], where)
+    _run(["avr-gcc", *arduino_flags(chip), *flags, "-c", *parts], where)
     _run(["avr-ar", "rcs", "core.a", *sorted(where.glob("*.o"))], where)
     return where / "core.a"
 
 
-def build_sketch(core: Path, where: Path, *changes: tuple[str, str], more: str = "") -> Path:
+SKETCH = FIRMWARE / "acsar" / "acsar.ino"
+
+
+def build_sketch(
+    core: Path, where: Path, chip: Chip, *changes: tuple[str, str], more: str = ""
+) -> Path:
     """Build the Arduino sketch as the IDE does, after changes in its text, with more text below."""
-    text = (FIRMWARE / "acsar" / "acsar.ino").read_text()
+    text = SKETCH.read_text()
     for old, new in changes:
         assert old in text
         text = text.replace(old, new)
     source, elf = where / "acsar.cpp", where / "acsar.elf"
     source.write_text("#include <Arduino.h>\n" + text + more)
     flags = ["-Wall", "-Wextra", "-Werror", "-Wl,--gc-sections"]
-    _run(["avr-g++", *ARDUINO_FLAGS, *flags, "-o", elf, source, core, "-lm"], where)
+    _run(["avr-g++", *arduino_flags(chip), *flags, "-o", elf, source, core, "-lm"], where)
+    sizes = _run(["avr-size", "--format=avr", f"--mcu={chip.name}", elf], where)
+    print(chip.name, *(line for line in sizes.splitlines() if "Full" in line), sep="\n")
     return elf
 
 
@@ -230,6 +250,7 @@ class Board:
         self._words = [str(runner), *options, str(firmware)]
         self._held = b""
         self.live = live
+        self.motors = 2 if UNO.board in options else 4
         self.path = ""
         """The path of its port."""
 
@@ -350,10 +371,10 @@ class Board:
 
 
 def speeds_line(speeds: Sequence[float]) -> bytes:
-    """Return the plain line for these wheel speeds in rad/s, without CR LF."""
+    """Return the plain line for these speeds of motors a, b ... in rad/s, without CR LF."""
     return ",".join(
         f"{letter}{'n' if speed < 0 else 'p'}{abs(speed):05.2f}"
-        for letter, speed in zip("abcd", speeds, strict=True)
+        for letter, speed in zip("abcd", speeds, strict=False)
     ).encode()
 
 
@@ -392,8 +413,8 @@ class Reply(NamedTuple):
     """A reply of the board."""
 
     line: bytes
-    speeds: Speeds
-    """rad/s of motors a to d."""
+    speeds: tuple[float, ...]
+    """rad/s of motors a to d, or a and b."""
     sequence: int | None
     milliseconds: int | None
     counts: tuple[int, ...]
@@ -403,24 +424,24 @@ class Reply(NamedTuple):
 def read_reply(line: bytes) -> Reply:
     """Decode a reply. Fails if its checksum is wrong or its format differs from the contract."""
     plain, mark, suffix = line.partition(b"#")
-    assert len(plain) == 31, line
-    speeds = [float(plain[i + 2 : i + 7]) for i in range(0, 32, 8)]
-    signed = [s if plain[8 * i + 1 : 8 * i + 2] == b"p" else -s for i, s in enumerate(speeds)]
-    a, b, c, d = signed
-    assert speeds_line((a, b, c, d)) == plain, line
+    assert len(plain) in (15, 31), line
+    signed = tuple(
+        float(word[2:]) if word[1:2] == b"p" else -float(word[2:]) for word in plain.split(b",")
+    )
+    assert speeds_line(signed) == plain, line
     if not mark:
-        return Reply(line, (a, b, c, d), None, None, ())
+        return Reply(line, signed, None, None, ())
     body, star, crc = suffix.rpartition(b"*")
     assert star, line
     assert crc == b"%04X" % binascii.crc_hqx(line[: -len(crc) - 1], 0), line
     sequence, at_sign, sample = body.partition(b"@")
     assert sequence == b"%02X" % int(sequence, 16), line
     if not at_sign:
-        return Reply(line, (a, b, c, d), int(sequence, 16), None, ())
+        return Reply(line, signed, int(sequence, 16), None, ())
     assert len(sample) == 20, line
     words = [int(sample[i : i + 4], 16) for i in range(0, 20, 4)]
     assert sample == b"".join(b"%04X" % word for word in words), line
-    return Reply(line, (a, b, c, d), int(sequence, 16), words[0], tuple(words[1:]))
+    return Reply(line, signed, int(sequence, 16), words[0], tuple(words[1:]))
 
 
 class Host:
@@ -495,10 +516,22 @@ class Host:
             if line.startswith(b"!"):
                 return read_identity(line)
 
+    def line(self, speeds: Sequence[float]) -> bytes:
+        """Return the plain line with those of these speeds for which the board has motors."""
+        return speeds_line(speeds[: self.board.motors])
+
+    @property
+    def zeros(self) -> bytes:
+        return self.line((0.0,) * 4)
+
+    def turns(self) -> list[float]:
+        """Return the true speeds of the motors that the board has, rad/s."""
+        return [motor.speed for motor in self.board.status().motors[: self.board.motors]]
+
     def stop(self) -> None:
         """Send a stop and wait for its answer. After a boot the board accepts nothing else."""
         self.lines()
-        self.send(STOP)
+        self.send(self.zeros)
         self.says(b"ap")
         self._stopped = True
 
@@ -513,7 +546,7 @@ class Host:
         if not self._stopped:
             self.stop()
         for _ in range(round(seconds / period)):
-            line = speeds_line(speeds)
+            line = self.line(speeds)
             self.send(line if self.plain else checked(line, self._sequence, letters))
             self._sequence = (self._sequence + 1) % 256
             came = self.lines(1000 * period)

@@ -11,6 +11,7 @@ import pytest
 
 from tests.firmware.board import (
     Board,
+    Chip,
     Host,
     Library,
     build_core,
@@ -80,21 +81,15 @@ def firmware(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="session")
-def core(firmware: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The library of the Arduino core."""
-    return build_core(tmp_path_factory.mktemp("core"))
+def sketch(firmware: Path, tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Path]:
+    """Return a function that builds the sketch for a chip, with these changes, once each."""
+    core = cache(lambda chip: build_core(tmp_path_factory.mktemp("core"), chip))
 
+    def build(chip: Chip, *changes: tuple[str, str], more: str = "") -> Path:
+        where = tmp_path_factory.mktemp(f"sketch_{chip.board}")
+        return build_sketch(core(chip), where, chip, *changes, more=more)
 
-@pytest.fixture(scope="session")
-def sketch(core: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The ELF file of the Arduino sketch."""
-    return build_sketch(core, tmp_path_factory.mktemp("sketch"))
-
-
-@pytest.fixture(scope="session")
-def wired_sketch(core: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The ELF file of the sketch with an emergency stop."""
-    return build_sketch(core, tmp_path_factory.mktemp("wired"), ("ESTOP = -1", f"ESTOP = {ESTOP}"))
+    return cache(build)
 
 
 @pytest.fixture(scope="session")

@@ -1,9 +1,10 @@
 /* A board on the bench: runs the firmware's machine code in libsimavr, behind a pty, with four motors.
  *
- * runner [--baud N] [--free-speed A,B,C,D] [--counts N] FIRMWARE.elf
+ * runner [--board mega-c|mega|uno] [--baud N] [--free-speed A,B,C,D] [--counts N] FIRMWARE.elf
  *
  * It is wired as the page howto/wire of the manual says, from numbers of its own: an error in the firmware's
- * pins is not repeated here. Time is the wall clock's, in slices of half a millisecond; a machine too
+ * pins is not repeated here. `mega-c` has the encoders where the C firmware needs them, `uno` is an
+ * ATmega328P with two motors. Time is the wall clock's, in slices of half a millisecond; a machine too
  * slow for that is not caught up with for more than CATCH_UP_NS, the rest is skipped and counted.
  *
  * As root it takes precedence over all usual processes, because nothing that else runs on this machine
@@ -56,28 +57,49 @@
 #define MOTORS 4
 #define QUEUE 16384
 
-/* Registers of the ATmega2560, as data addresses (data sheet, register summary). */
+/* Registers of both chips, as data addresses (data sheets, register summary). */
 enum {
-    DDRA = 0x21, PORTA = 0x22, PINC = 0x26, DDRC = 0x27, PORTC = 0x28,
-    DDRE = 0x2D, PORTE = 0x2E, DDRH = 0x101, PORTH = 0x102,
-    PCIFR = 0x3B, PCICR = 0x68, PCMSK2 = 0x6D,
+    PINC = 0x26, DDRC = 0x27, PORTC = 0x28, PCIFR = 0x3B, PCICR = 0x68, PCMSK2 = 0x6D,
+    TCCR1A = 0x80, TCCR1B = 0x81, ICR1 = 0x86, OCR1A = 0x88, TCCR2A = 0xB0, TCCR2B = 0xB1, OCR2A = 0xB3,
     TCCR3A = 0x90, TCCR3B = 0x91, ICR3 = 0x96, OCR3A = 0x98,
     TCCR4A = 0xA0, TCCR4B = 0xA1, ICR4 = 0xA6, OCR4A = 0xA8, OCR4B = 0xAA, OCR4C = 0xAC,
-    UCSR0A = 0xC0, UBRR0 = 0xC4, MCUSR = 0x54,
-    PINK = 0x106
+    UCSR0A = 0xC0, UBRR0 = 0xC4, MCUSR = 0x54
 };
 enum { PCINT2 = 11, EXTRF = 1 << 1 };
 
-/* Where the PWM of each motor comes from: Mega pins 5, 6, 7, 8. */
-static const struct pwm {
-    uint16_t control_a, control_b, top, compare, ddr;
-    uint8_t mode_shift, pin;
-} PWM[MOTORS] = {
-    {TCCR3A, TCCR3B, ICR3, OCR3A, DDRE, 6, 3},
-    {TCCR4A, TCCR4B, ICR4, OCR4A, DDRH, 6, 3},
-    {TCCR4A, TCCR4B, ICR4, OCR4B, DDRH, 4, 4},
-    {TCCR4A, TCCR4B, ICR4, OCR4C, DDRH, 2, 5},
+struct line {
+    char port;
+    uint8_t bit;
 };
+
+/* Where the PWM of each motor comes from, and the lines of its bridge and its encoder. */
+static const struct board {
+    const char *name, *chip;
+    int motors;
+    struct pwm {
+        uint16_t control_a, control_b, top, compare;
+        struct line line;
+        uint8_t mode_shift, clock; /* of analogWrite: a 64th of the chip's */
+    } pwm[MOTORS];
+    struct line forward[MOTORS], reverse[MOTORS], a[MOTORS], b[MOTORS];
+} BOARDS[] = {
+#define MEGA                                                                                       \
+    "atmega2560", 4,                                                                               \
+    {{TCCR3A, TCCR3B, ICR3, OCR3A, {'E', 3}, 6, 3}, {TCCR4A, TCCR4B, ICR4, OCR4A, {'H', 3}, 6, 3},   \
+     {TCCR4A, TCCR4B, ICR4, OCR4B, {'H', 4}, 4, 3}, {TCCR4A, TCCR4B, ICR4, OCR4C, {'H', 5}, 2, 3}}, \
+    {{'A', 0}, {'A', 2}, {'A', 4}, {'A', 6}}, {{'A', 1}, {'A', 3}, {'A', 5}, {'A', 7}}
+    {"mega-c", MEGA, {{'K', 0}, {'K', 2}, {'K', 4}, {'K', 6}}, {{'K', 1}, {'K', 3}, {'K', 5}, {'K', 7}}},
+    {"mega", MEGA, {{'E', 4}, {'E', 5}, {'D', 3}, {'D', 2}}, {{'K', 1}, {'K', 3}, {'K', 5}, {'K', 7}}},
+    {"uno", "atmega328p", 2,
+     {{TCCR1A, TCCR1B, ICR1, OCR1A, {'B', 1}, 6, 3}, {TCCR2A, TCCR2B, 0, OCR2A, {'B', 3}, 6, 4}},
+     {{'B', 4}, {'D', 7}}, {{'B', 5}, {'B', 0}}, {{'D', 3}, {'D', 2}}, {{'D', 5}, {'D', 4}}},
+};
+static const struct board *board = BOARDS;
+
+static uint16_t pin_register(char port) /* its direction and its output are the next two */
+{
+    return (uint16_t)(port < 'H' ? 0x20 + 3 * (port - 'A') : 0x100 + 3 * (port - (port > 'I') - 'H'));
+}
 
 enum encoder { OK, DEAD, SWAPPED };
 
@@ -123,7 +145,8 @@ static int64_t wanted_ns; /* when it last wanted a motor to turn */
 
 static avr_t *avr;
 static avr_uart_t *uart;
-static avr_ioport_t *port_c, *port_k;
+static avr_ioport_t *port_c;
+static avr_ioport_t *ports['L' + 1]; /* with encoders */
 static avr_irq_t *uart_input, *adc;
 static avr_int_vector_t pin_change;
 
@@ -225,19 +248,29 @@ static uint8_t levels(const struct motor *motor)
     return (motor->encoder == SWAPPED ? swapped : gray)[motor->counts & 3];
 }
 
+static void show_level(struct line line, bool level)
+{
+    uint8_t mask = (uint8_t)(1u << line.bit);
+    avr_ioport_t *port = ports[(int)line.port];
+
+    if (!(avr->data[pin_register(line.port)] & mask) == !level)
+        return;
+    /* or writing the pull-ups would set all pins */
+    port->external.pull_value = (uint8_t)((port->external.pull_value & ~mask) | (level ? mask : 0));
+    avr->data[pin_register(line.port)] ^= mask; /* after a reset the next line alone would not do it */
+    avr_raise_irq(avr_io_getirq(avr, AVR_IOCTL_IOPORT_GETIRQ(line.port), line.bit), level);
+    if (line.port == 'K' && avr->data[PCMSK2] & mask)
+        avr_raise_interrupt(avr, &pin_change);
+}
+
 static void show_encoder(int index)
 {
-    uint8_t mask = (uint8_t)(3u << (2 * index)), was = avr->data[PINK], now;
+    uint8_t now = levels(&motors[index]);
 
     if (motors[index].encoder == DEAD)
         return;
-    now = (uint8_t)((was & ~mask) | levels(&motors[index]) << (2 * index));
-    if (now == was)
-        return;
-    avr->data[PINK] = now;
-    port_k->external.pull_value = now; /* or writing the pull-ups would set all pins */
-    if ((now ^ was) & avr->data[PCMSK2])
-        avr_raise_interrupt(avr, &pin_change);
+    show_level(board->a[index], now & 1);
+    show_level(board->b[index], now >> 1);
 }
 
 /* Moves one motor and shows at most one edge; returns when to look again. */
@@ -300,7 +333,7 @@ static avr_cycle_count_t on_top(avr_t *unused, avr_cycle_count_t when, void *whi
 
 /* The simulator has no double buffer: in PWM mode a compare register is in force from the next time
  * that the counter, up and down, is at its top; else at once. Looked at whenever one is written. */
-static void take_over(int index, bool counts, unsigned top, unsigned cycles)
+static void take_over(int index, bool counts, unsigned top, unsigned cycles, unsigned written)
 {
     struct motor *motor = &motors[index];
     avr_cycle_count_t since;
@@ -309,7 +342,7 @@ static void take_over(int index, bool counts, unsigned top, unsigned cycles)
         motor->timer.counts = counts;
         motor->timer.started = avr->cycle;
         motor->timer.tops = 0;
-        motor->timer.written = motor->timer.compare = word(PWM[index].compare);
+        motor->timer.written = motor->timer.compare = written;
         return;
     }
     since = (avr->cycle - motor->timer.started) / cycles;
@@ -317,7 +350,7 @@ static void take_over(int index, bool counts, unsigned top, unsigned cycles)
         motor->timer.tops = (since + top) / (2 * top);
         motor->timer.compare = motor->timer.written;
     }
-    motor->timer.written = word(PWM[index].compare);
+    motor->timer.written = written;
     if (motor->timer.written != motor->timer.compare)
         avr_cycle_timer_register(avr, ((2 * motor->timer.tops + 1) * top - since) * cycles, on_top,
                                  (void *)(intptr_t)index);
@@ -327,22 +360,31 @@ static void take_over(int index, bool counts, unsigned top, unsigned cycles)
  * Arduino's analogWrite has it, or the port when the timer does not have the pin. */
 static double pwm(int index)
 {
-    const struct pwm *pwm = &PWM[index];
+    const struct pwm *pwm = &board->pwm[index];
+    uint16_t ddr = pin_register(pwm->line.port) + 1;
     uint8_t a = avr->data[pwm->control_a], b = avr->data[pwm->control_b];
-    bool arduino = (a & 3) == 1 && !(b >> 3 & 3) && (b & 7) == 3;
+    bool arduino = (a & 3) == 1 && !(b >> 3 & 3) && (b & 7) == pwm->clock;
     unsigned top = arduino ? 255 : word(pwm->top), compare;
     bool counts = arduino || ((a & 3) == 2 && (b >> 3 & 3) == 2 && (b & 7) == 1 && top);
     unsigned mode = a >> pwm->mode_shift & 3;
 
-    take_over(index, counts, top, arduino ? 64 : 1);
+    take_over(index, counts, top, arduino ? 64 : 1,
+              pwm->top ? word(pwm->compare) : avr->data[pwm->compare]);
     compare = motors[index].timer.compare;
-    if (!(avr->data[pwm->ddr] >> pwm->pin & 1))
+    if (!(avr->data[ddr] >> pwm->line.bit & 1))
         return 0.0;
     if (!mode)
-        return avr->data[pwm->ddr + 1] >> pwm->pin & 1;
+        return avr->data[ddr + 1] >> pwm->line.bit & 1;
     if (!counts || mode != 2)
         return 0.0;
     return compare >= top ? 1.0 : (double)compare / top;
+}
+
+static uint8_t output(struct line line)
+{
+    uint16_t ddr = pin_register(line.port) + 1;
+
+    return avr->data[ddr] & avr->data[ddr + 1] & 1 << line.bit ? 1 : 0;
 }
 
 static void look_at_bridges(void)
@@ -350,9 +392,9 @@ static void look_at_bridges(void)
     bool any = false;
     int i;
 
-    for (i = 0; i < MOTORS; i++) {
+    for (i = 0; i < board->motors; i++) {
         struct motor *motor = &motors[i];
-        uint8_t pins = (avr->data[PORTA] & avr->data[DDRA]) >> (2 * i) & 3;
+        uint8_t pins = output(board->forward[i]) | output(board->reverse[i]) << 1;
         double size = pwm(i);
         double duty = pins == 1 ? size : pins == 2 ? -size : 0.0;
 
@@ -385,7 +427,7 @@ static void on_register(avr_irq_t *irq, uint32_t value, void *address)
 {
     (void)irq;
     (void)value;
-    if ((intptr_t)address == ICR3 || (intptr_t)address == ICR4)
+    if (board->motors == 4 && ((intptr_t)address == ICR3 || (intptr_t)address == ICR4))
         check_top((uint16_t)(intptr_t)address);
     look_at_bridges();
     show_contacts();
@@ -581,7 +623,7 @@ static void after_reset(void)
     resets++;
     stop_bytes = false;
     receiving = false;
-    for (i = 0; i < MOTORS; i++) {
+    for (i = 0; i < board->motors; i++) {
         motors[i].counts_at_reset = motors[i].counts;
         show_encoder(i);
         avr_cycle_timer_register(avr, 16, on_motor, (void *)(intptr_t)i);
@@ -877,20 +919,30 @@ static void say_nothing(avr_t *unused, const int level, const char *format, va_l
         vfprintf(stderr, format, arguments);
 }
 
+static void watch(uint16_t address)
+{
+    static bool watched[0x200];
+
+    if (watched[address])
+        return;
+    watched[address] = true;
+    avr_irq_register_notify(avr_iomem_getirq(avr, address, NULL, AVR_IOMEM_IRQ_ALL), on_register,
+                            (void *)(intptr_t)address);
+}
+
 static void power_on(const char *path)
 {
-    static const uint16_t watched[] = {PORTA, DDRA,  DDRE,  DDRH,  PORTE,  PORTH,  TCCR3A, TCCR3B, TCCR4A,
-                                       TCCR4B, OCR3A, OCR4A, OCR4B, OCR4C,  ICR3,   ICR4,   PORTC,  DDRC};
     elf_firmware_t firmware;
     uint32_t no_flags = 0;
     size_t i;
+    int motor;
 
     memset(&firmware, 0, sizeof firmware);
     if (elf_read_firmware(path, &firmware))
         fail("%s: not a firmware", path);
-    avr = avr_make_mcu_by_name("atmega2560");
+    avr = avr_make_mcu_by_name(board->chip);
     if (!avr)
-        fail("this libsimavr has no atmega2560");
+        fail("this libsimavr has no %s", board->chip);
     avr_global_logger_set(say_nothing);
     avr_init(avr);
     firmware.frequency = F_CPU;
@@ -904,8 +956,13 @@ static void power_on(const char *path)
 
     uart = module("uart", '0');
     port_c = module("port", 'C');
-    port_k = module("port", 'K');
-    port_c->external.pull_mask = port_k->external.pull_mask = 0xFF;
+    port_c->external.pull_mask = 0xFF;
+    for (motor = 0; motor < 2 * board->motors; motor++) {
+        struct line line = (motor % 2 ? board->a : board->b)[motor / 2];
+
+        ports[(int)line.port] = module("port", line.port);
+        ports[(int)line.port]->external.pull_mask |= (uint8_t)(1u << line.bit);
+    }
     adc = avr_io_getirq(avr, AVR_IOCTL_ADC_GETIRQ, 0);
     avr->vcc = avr->avcc = avr->aref = 5000;
     avr_ioctl(avr, AVR_IOCTL_UART_SET_FLAGS('0'), &no_flags);
@@ -921,10 +978,19 @@ static void power_on(const char *path)
     pin_change.raised = (avr_regbit_t)AVR_IO_REGBIT(PCIFR, 2);
     avr_register_vector(avr, &pin_change);
 
-    for (i = 0; i < sizeof watched / sizeof *watched; i++)
-        avr_irq_register_notify(
-            avr_iomem_getirq(avr, watched[i], NULL, AVR_IOMEM_IRQ_ALL), on_register,
-            (void *)(intptr_t)watched[i]);
+    watch(PORTC), watch(DDRC);
+    for (motor = 0; motor < board->motors; motor++) {
+        const struct pwm *pwm = &board->pwm[motor];
+
+        watch(pwm->control_a), watch(pwm->control_b), watch(pwm->compare);
+        if (pwm->top)
+            watch(pwm->top);
+        for (i = 1; i < 3; i++) {
+            watch(pin_register(pwm->line.port) + (uint16_t)i);
+            watch(pin_register(board->forward[motor].port) + (uint16_t)i);
+            watch(pin_register(board->reverse[motor].port) + (uint16_t)i);
+        }
+    }
     after_reset();
     resets = 0;
 }
@@ -946,7 +1012,12 @@ int main(int count, char **words)
         else if (!strcmp(words[i], "--free-speed"))
             sscanf(value, "%lf,%lf,%lf,%lf", &motors[0].free_speed, &motors[1].free_speed,
                    &motors[2].free_speed, &motors[3].free_speed);
-        else
+        else if (!strcmp(words[i], "--board")) {
+            while (board < BOARDS + sizeof BOARDS / sizeof *BOARDS && strcmp(board->name, value))
+                board++;
+            if (board == BOARDS + sizeof BOARDS / sizeof *BOARDS)
+                fail("unknown board %s", value);
+        } else
             fail("unknown option %s", words[i]);
     }
     if (i != count - 1)

@@ -12,11 +12,12 @@ from acsard.core.config.settings import (
     Config,
     DriveConfig,
     McuConfig,
+    SimConfig,
     WheelMap,
 )
 from acsard.core.messages.schema import Beat, JointState, TFMessage
 from tests.scenarios.world import World
-from tests.wheels import FOUR, four_and_two
+from tests.wheels import FOUR, TWO, four_and_two
 
 
 @pytest.fixture
@@ -237,3 +238,28 @@ def test_checked_replies_give_the_round_trip_time_of_the_microcontroller() -> No
     round_trip = world.state.latencies["mcu_round_trip"].since_start
     assert round_trip.count > 50
     assert 6_700 <= round_trip.p50 <= 12_000
+
+
+def test_the_course_robot_drives_and_turns_with_all_its_faults() -> None:
+    """At each reversal its board gives a whole report the sign of its last edge."""
+    faults = "free_running", "comma_latched", "no_watchdog", "last_edge", "toggled_direction"
+    world = World(
+        Config(
+            mcu=McuConfig(wheels=TWO, trailing_comma=True, reply_period=0.1),
+            sim=SimConfig(faults=faults, encoder_counts=385),
+        )
+    )
+    world.run(0.3)
+    world.send(0.0)
+    world.run(0.05)
+    for _ in range(20):
+        world.drive(0.3, 0.2, seconds=1.0)
+        world.drive(-0.3, seconds=0.5)
+        world.send(0.0)
+        world.run(1.0)
+    truth, pose = world.mcu.vehicle.pose, world.odom.pose.pose.position
+    error_m = math.hypot(pose.x - truth.x, pose.y - truth.y)
+    print(f"20 reversals: {error_m * 1000:.1f} mm, {world.state.yaw - truth.yaw:+.4f} rad")
+    assert error_m < 0.02
+    assert world.state.yaw == pytest.approx(truth.yaw, abs=0.02)
+    assert world.state.code == "no_command"

@@ -16,7 +16,7 @@ RULES = "/etc/udev/rules.d/70-acsar.rules"
 
 USB = "/devices/pci0000:00/0000:00:14.0/usb1/1-1"
 
-OTHERS = ["2341:0043", "1a86:5523", "0403:6010", "1234:0042", "0042:2341"]
+OTHERS = ["2341:8036", "1a86:5523", "0403:6010", "1234:0042", "0042:2341"]
 
 
 class Verdict(NamedTuple):

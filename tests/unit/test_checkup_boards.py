@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from msgspec import structs
 
 from acsard.checkup import inputs
 from acsard.checkup.findings import Finding, motor_name
@@ -41,6 +42,14 @@ WIRED = Config(mcu=McuConfig(wheels=WheelMap("-c", "+d", "-a", "+b")))
 
 def at_baud(rate: Any) -> Config:
     return Config(mcu=McuConfig(baud_rate=rate))
+
+
+# The board of the course robot, as `howto/course-robot.md` configures it.
+COURSE = Config(mcu=structs.replace(TWO_WHEELS.mcu, trailing_comma=True, reply_period=0.1))
+
+
+def with_lag(seconds: float) -> Config:
+    return structs.replace(COURSE, sim=SimConfig(motor_time_constant=seconds))
 
 
 # Maps the pages to boards: the faults, the settings of the host, and whether a person watches.
@@ -110,6 +119,14 @@ BOARDS: dict[str, dict[str, tuple[str, dict[str, Any], bool]]] = {
         "other letters": ("free_running", {"config": TWO_WHEELS, "wheels": WheelMap()}, False),
         "letters of four": (
             "free_running", {"wheels": TWO_WHEELS.mcu.wheels}, False),
+    },
+    "course": {
+        "plain": ("free_running plain_only", {"config": COURSE}, True),
+        **{part: (f"free_running comma_latched {part}", {"config": COURSE}, True)
+           for part in ["last_edge", "toggled_direction", "no_watchdog",
+                        "last_edge toggled_direction no_watchdog"]},
+        "quick motors": ("free_running plain_only", {"config": with_lag(0.03)}, True),
+        "slow motors": ("free_running plain_only", {"config": with_lag(0.2)}, True),
     },
     "firmware": {
         "plain": ("plain_only", {}, False),

@@ -6,6 +6,8 @@ from contextlib import ExitStack, suppress
 from itertools import pairwise
 from typing import Any
 
+import pytest
+
 from acsard.core.config.settings import Config, SimConfig
 from acsard.core.config.simulated_faults import FAULTS, parse
 from acsard.core.simulator.fake_mcu import MS, RESET_NS, FakeMcu
@@ -24,7 +26,7 @@ SEALED = LINE[:-2] + b"#07S*EE6B\r\n"
 
 # Faults that a user writes without arguments, and three others, with their arguments.
 CASES: dict[str, tuple[float, ...]] = {
-    **{name: () for name, fault in FAULTS.items() if not fault.arguments},
+    **{name: () for name, fault in FAULTS.items() if not fault.arguments and name != "last_edge"},
     "bias": (2, 1.5),
     "stuck_encoder": (1,),
     "frozen_encoder": (2,),
@@ -33,7 +35,9 @@ CASES: dict[str, tuple[float, ...]] = {
 
 def story(mcu: FakeMcu, start_ns: int) -> tuple[Heard, list[float], list[float]]:
     """Drive for half a second, then send only one invalid line."""
-    chunks = drive(mcu, start_ns, 40) + drive(mcu, start_ns + 400 * MS, 10, SEALED)
+    chunks = drive(mcu, start_ns, 40)
+    mcu.receive(start_ns + 400 * MS, b"bp\r\n")
+    chunks += drive(mcu, start_ns + 400 * MS, 10, SEALED)
     chunks += replies(mcu, start_ns + 650 * MS)
     mcu.receive(start_ns + 650 * MS, b"ap0\r\n")
     chunks += replies(mcu, start_ns + 1000 * MS)
@@ -109,6 +113,31 @@ def test_a_free_running_board_reports_by_its_own_clock_unpadded_and_with_a_comma
         assert b"," not in mcu.advance(400 * MS + RESET_NS)
     with mcu.fault("free_running", 0.1):  # entered twice, it is not twice as fast
         assert 9 <= mcu.advance(1400 * MS + RESET_NS).count(b"ap0.00") <= 10
+
+
+@each(("fault", "reported"), [((), 3.0), (("last_edge",), 10.0)])
+def test_a_reversal_between_two_reports(fault: tuple[str, ...], reported: float) -> None:
+    """The motors turn forward for 65 ms and back for 35 ms. The fault adds both, and says back."""
+    mcu, line = FakeMcu(TRUE), b"ap%b,bp00.00,cp00.00,dp00.00\r\n"
+    with ExitStack() as on:
+        for name in ("free_running", *fault):
+            on.enter_context(mcu.fault(name))
+        chunks = drive(mcu, 0, 16, line % b"10.00")
+        chunks += drive(mcu, 160 * MS, 8, line.replace(b"ap", b"an") % b"10.00")
+    text = chunks[-1][1]
+    assert len(chunks) == 2
+    assert text[1:2] == (b"n" if fault else b"p")
+    assert float(text[2:].split(b",")[0]) == pytest.approx(reported, abs=0.9)
+
+
+def test_a_line_cut_behind_its_sign_reverses_a_toggled_direction_for_good() -> None:
+    mcu, line = FakeMcu(TRUE), b"ap10.00,bp10.00,cp00.00,dp00.00\r\n"
+    with mcu.fault("toggled_direction"):
+        drive(mcu, 0, 2, line)
+        assert mcu.vehicle.set_points == [10.0, 10.0, 0.0, 0.0]
+        drive(mcu, 20 * MS, 1, b"ap10.00,bn\r\n")
+        drive(mcu, 30 * MS, 2, line)
+        assert mcu.vehicle.set_points == [10.0, -10.0, 0.0, 0.0]
 
 
 # The switches.

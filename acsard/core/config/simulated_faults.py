@@ -75,6 +75,8 @@ class Switches(Struct):
     reply_gap_ns: Ns = 0
     push: float | None = None  # m/s, by a person
     firmware: Literal["reference", "latched", "prefix", "plain_only"] = "reference"
+    toggled: bool = False  # direction pins
+    last_edge: bool = False  # which gives all edges of a report its direction
     samples: bool = True
     latency_ns: Ns = 0  # of the USB adapter, which sends its packet then; 0: none
     stall_every_ns: Ns = 0
@@ -174,6 +176,12 @@ FAULTS = {
         partial(replace, ending=",\r\n")),
     "comma_latched": Fault("", "The board obeys each speed with a comma, and ignores checksums.",
         partial(replace, firmware="latched")),
+    "toggled_direction": Fault("", "The board toggles a direction pin at a sign that differs from "
+        "the last whole value's: a cut line can reverse the motor for good.",
+        partial(replace, toggled=True)),
+    "last_edge": Fault("", "The board counts edges of both directions alike; the last one of a "
+        "report decides the sign.",
+        partial(replace, last_edge=True)),
     "no_check": Fault("", "The board ignores the host's checksums, and replies without checksums.",
         partial(replace, firmware="prefix")),
     "plain_only": Fault("", "The board obeys only plain lines: one with a checksum is invalid.",

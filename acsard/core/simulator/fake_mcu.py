@@ -92,6 +92,8 @@ class FakeMcu:
         self._measured = [0.0] * motors
         self._moved = [0] * motors
         self._counted = [0.0] * motors
+        self._edges, self._edge_signs = [0] * motors, [1] * motors  # since the last report
+        self._signs, self._pins = [1] * motors, [1] * motors  # of directions: noted, in force
         self._replied_ns = now_ns - NS_PER_S
         # Lines of the host with the time of their last byte, valid or not, obeyed or not.
         self.heard: deque[tuple[int, bytes]] = deque(maxlen=4096)
@@ -211,6 +213,11 @@ class FakeMcu:
             vehicle.advance((now_ns - moved_ns) / NS_PER_S, self.switches.push)
             moved_ns = now_ns
         self._moved_ns = moved_ns
+        if self.switches.last_edge:
+            before = self._seen
+            for motor, (old, new) in enumerate(zip(before, self._count(), strict=True)):
+                self._edges[motor] += abs(new - old)
+                self._edge_signs[motor] = (new > old) - (new < old) or self._edge_signs[motor]
 
     # Lines.
 
@@ -218,6 +225,8 @@ class FakeMcu:
         if line.rstrip(b"\r\n") == b"?":
             self._send_identity(now_ns)
             return
+        if self.switches.toggled:
+            self._toggle(line)
         command = self.understand(line)
         if command is None:
             if self.switches.any_feeds:
@@ -232,6 +241,8 @@ class FakeMcu:
             wheels, forward = self._wiring[motor]
             if abs(value) < self.switches.dead_band:
                 value = 0.0
+            if self.switches.toggled:
+                value = abs(value) * self._pins[output]
             for wheel in wheels:
                 set_points[wheel] = forward * self.switches.drives[motor] * value
         self.valid_lines += 1
@@ -242,6 +253,18 @@ class FakeMcu:
     def understand(self, line: bytes) -> protocol.BoardCommand | None:
         """Decode a line of the host as the firmware does."""
         return protocol.DECODERS[self.switches.firmware](line, self.letters)
+
+    def _toggle(self, line: bytes) -> None:
+        tokens = line.split(b",")
+        for place, token in enumerate(tokens):
+            motor = self.letters.encode().find(token[:1] or b"?")
+            sign = {b"p": 1, b"n": -1}.get(token[1:2])
+            if motor < 0 or not sign:
+                continue
+            if sign != self._signs[motor]:
+                self._pins[motor] *= -1
+            if place < len(tokens) - 1:
+                self._signs[motor] = sign
 
     def _send_identity(self, now_ns: Ns) -> None:
         switches = self.switches
@@ -297,7 +320,11 @@ class FakeMcu:
         return waited[:full]
 
     def _encoders(self) -> list[int]:
-        angles = self.vehicle.angles
+        self._catch_up()
+        return self._count()
+
+    def _count(self) -> list[int]:
+        angles = self._vehicle.angles
         if angles != self._angles:
             floor, tau, per_turn = math.floor, math.tau, self._counts
             self._angles = angles.copy()
@@ -318,6 +345,9 @@ class FakeMcu:
                 return [0.0] * self._motors
             scale = math.tau / self._counts * NS_PER_S / (now_ns - since)
             every = [b - a for a, b in zip(before, counts, strict=True)]
+            if switches.last_edge:
+                pairs = zip(self._edges, self._edge_signs, strict=True)
+                every, self._edges = [edges * sign for edges, sign in pairs], [0] * self._motors
             signs = switches.encoder_signs
             moved = [every[encoder] * signs[encoder] for encoder in switches.encoders]
             if switches.frozen is not None:
