@@ -7,7 +7,8 @@ from typing import Literal
 
 from acsard.core.values import NS_PER_S, WallNs
 
-EXPIRY_DAYS = 30  # remaining, below which `state` and `diagnostics` warn
+# Remaining days. Below the first, `state` and `diagnostics` warn; the log says each.
+EXPIRY_DAYS = 30, 7, 1
 
 DAY_NS = 86400 * NS_PER_S
 
@@ -33,10 +34,20 @@ def expiry(ends: Mapping[str, WallNs], now_ns: WallNs) -> tuple[CertificateCode,
     of = f" (certificate of {whose})" if whose else ""
     days = (ends_ns - now_ns) / DAY_NS
     if days < 0:
-        return "expired", f"expired {-days:.0f} days ago{of}{_effect(ends, now_ns)}"
-    if days < EXPIRY_DAYS:
-        return "expires", f"expires in {days:.0f} days{of}"
+        return "expired", f"expired {_span(-days)} ago{of}{_effect(ends, now_ns)}"
+    if days < EXPIRY_DAYS[0]:
+        return "expires", f"expires in {_span(days)}{of}"
     return "valid", f"valid for {days:.0f} days{of}"
+
+
+def urgency(ends: Mapping[str, WallNs], now_ns: WallNs) -> int:
+    """Return how many of `EXPIRY_DAYS` the first expiry is below."""
+    days = (first_expiry(ends)[1] - now_ns) / DAY_NS
+    return sum(days < bound for bound in EXPIRY_DAYS)
+
+
+def _span(days: float) -> str:
+    return f"{days:.0f} days" if days >= 2.0 else f"{24.0 * days:.0f} hours"
 
 
 def _effect(ends: Mapping[str, WallNs], now_ns: WallNs) -> str:
