@@ -1,5 +1,5 @@
 """Adds files to wheel and sdist: the commit of the source and, to wheels, the SBOM (PEP 770) and
-the manual.
+the manual. The README of the package has links to the files of that commit.
 
 hatchling runs this file when it builds.
 """
@@ -11,6 +11,21 @@ from pathlib import Path
 from typing import Any
 
 from hatchling.builders.hooks.plugin.interface import BuildHookInterface
+from hatchling.metadata.plugin.interface import MetadataHookInterface
+
+
+class ReadmeHook(MetadataHookInterface):
+    """Gives the package the README, whose links work outside the repository if it has a home."""
+
+    def update(self, metadata: dict[str, Any]) -> None:
+        sys.path.insert(0, self.root)
+        from acsard.host.version import source
+        from deploy.release import contents
+
+        text = Path(self.root, "README.md").read_text(encoding="utf-8")
+        home = metadata.get("urls", {}).get(contents.HOME, "")
+        text = contents.with_absolute_links(text, home, source())
+        metadata["readme"] = {"content-type": "text/markdown", "text": text}
 
 
 class CustomBuildHook(BuildHookInterface):

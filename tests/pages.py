@@ -18,6 +18,7 @@ ROOT = Path(__file__).resolve().parents[1]
 
 PAGES = ["README.md", "acsard/README.md", "tests/README.md", "deploy/README.md"]
 PAGES += [str(path.relative_to(ROOT)) for path in sorted(ROOT.glob("deploy/*/README.md"))]
+PAGES += [str(path.relative_to(ROOT)) for path in sorted(ROOT.glob(".github/**/*.md"))]
 
 MANUAL = [str(path.relative_to(ROOT)) for path in sorted(ROOT.glob("deploy/manual/pages/**/*.md"))]
 

@@ -120,7 +120,7 @@ def run(words: list[str], env: dict[str, str], within_s: float = WITHIN_S) -> tu
 @pytest.fixture(scope="module")
 def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return a directory with a wheel, the constraints, and a venv with uv and pipx."""
-    pytest.importorskip("hatch_fancy_pypi_readme", reason="only the build needs it")
+    pytest.importorskip("hatchling", reason="only the build needs it")
     where = tmp_path_factory.mktemp("made")
     clone, env = where / "clone", dict(os.environ)
     for words in (
@@ -183,7 +183,7 @@ def test_every_subcommand_of_an_installed_wheel_works_or_names_its_extra(
     code, output = run([str(acsard.resolve().parent / "python"), "-c", VERSIONS], env)
     assert code == 0, output
     installed = dict(line.split("==") for line in output.split())
-    tested = dict(contents.pins())
+    tested = {pin.name: pin.version for pin in contents.pins()}
     assert {name: tested.get(name) for name in installed} == installed
 
     def typed(text: str) -> list[str]:

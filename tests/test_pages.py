@@ -55,7 +55,8 @@ def calls(command: str) -> Iterator[list[str]]:
         if call[:2] == ["sh", "-c"]:
             yield from calls(call[2])
         elif Path(call[0]).name == "acsard":
-            yield call[1 : call.index(">") if ">" in call else None]
+            ends = [call.index(sign) for sign in (">", "|") if sign in call]
+            yield call[1 : min(ends, default=None)]
 
 
 @each("command", [text for text in COMMANDS if "acsard" in text])

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import json
 import os
 import re
 import shutil
 import subprocess
 import sys
+import tomllib
 import zipfile
 from collections.abc import Iterator
 from email.message import Message
@@ -18,9 +20,10 @@ import pytest
 from acsard import __version__
 from acsard.host.version import DIRTY, full_version, source_of
 from deploy.release import contents
+from tests.each import each
 from tests.pages import ROOT
 
-HOME = "https://github.com/acsard/acsard"
+HOME = "https://forge.test/owner/name"
 
 WORKFLOWS = sorted(Path(ROOT, ".github/workflows").glob("*.yml"))
 
@@ -39,6 +42,92 @@ def test_every_action_of_a_workflow_is_pinned_by_its_commit() -> None:
     assert [line for line in used if not re.fullmatch(r"\S+@[0-9a-f]{40}  # v[\d.]+", line)] == []
 
 
+@each(
+    ("said", "tag", "why"),
+    [
+        ("", f"v{__version__}", "has no Homepage"),
+        ("https://forge.test/other", f"v{__version__}", "says https://forge.test/other"),
+        (HOME, "v9.9.9", "the tag v9.9.9 is of another version"),
+        (HOME, f"v{__version__}", ""),
+    ],
+)
+def test_only_the_owners_repository_publishes_the_version_of_its_tag(
+    said: str, tag: str, why: str
+) -> None:
+    found = contents.unpublishable(said, HOME, __version__, tag)
+    assert why in found if why else not found
+
+
+@pytest.mark.skipif(bool(contents.home()), reason="the owner has named the home of the project")
+def test_a_build_to_publish_is_refused_until_the_owner_has_named_the_home(tmp_path: Path) -> None:
+    build, out = ROOT / "deploy/release/build", str(tmp_path / "out")
+    words = [sys.executable, str(build), "--publish", HOME, f"v{__version__}", "--out", out]
+    done = subprocess.run(words, capture_output=True, text=True, check=False)
+    assert done.returncode == 1
+    assert "build: [project.urls] in pyproject.toml has no Homepage" in done.stderr
+    assert not (tmp_path / "out").exists()
+
+
+def test_nothing_but_pyproject_toml_names_a_home_of_the_project() -> None:
+    """One line has it, so no other file can have an address that the owner did not give."""
+    home = re.compile(r"https?://[^\s\"')>]*/acsard(?:/acsard)?(?:[/\s\"')>]|$)")
+    files = [path for path in ROOT.rglob("*") if path.suffix in (".md", ".yml", ".toml", ".py")]
+    files = [path for path in files if not {".venv", ".git"} & set(path.parts)]
+    assert len(files) > 500
+    found = {path for path in files if home.search(path.read_text(encoding="utf-8"))}
+    assert found <= {ROOT / "pyproject.toml"}
+
+
+def test_links_of_a_page_lead_to_its_commit_once_there_is_a_home() -> None:
+    page = "[a](SECURITY.md#reports), [b](#start), [c](https://zenoh.io)"
+    assert contents.with_absolute_links(page, "", "1a2b") == page
+    tree = f"{HOME}/blob/1a2b/"
+    assert contents.with_absolute_links(page, HOME, "1a2b.dirty") == (
+        f"[a]({tree}SECURITY.md#reports), [b]({tree}README.md#start), [c](https://zenoh.io)"
+    )
+
+
+def test_the_notes_of_a_release_are_its_section_of_the_changelog() -> None:
+    text = "# Changelog\n\n## 0.3.0 (2026-12-24)\n\nNew.\n\n## 0.2.0 (2026-11-30)\n\nFirst.\n"
+    assert contents.notes(text, "0.3.0") == "New.\n"
+    assert contents.notes(text, "0.2.0") == "First.\n"
+    with pytest.raises(ValueError, match=r"no section of 0\.2"):
+        contents.notes(text, "0.2")
+    assert contents.notes(Path(ROOT, "CHANGELOG.md").read_text(), __version__.partition(".dev")[0])
+
+
+def test_each_library_of_the_sbom_has_its_licence_and_the_hashes_of_its_wheels() -> None:
+    document = json.loads(contents.sbom("0.2.0+1"))
+    components = document["components"] + document["metadata"]["component"]["components"]
+    assert len(components) > 25
+    for item in components:
+        assert item["licenses"], item["name"]
+        (wheels,) = item.get("externalReferences", [item])
+        assert all(re.fullmatch("[0-9a-f]{64}", one["content"]) for one in wheels["hashes"])
+        assert wheels["hashes"], item["name"]
+    names = {item["name"]: item["licenses"] for item in components}
+    assert names["aiohttp"] == [{"expression": "Apache-2.0 AND MIT"}]
+    assert {"license": {"name": "Apache Software License"}} in names["eclipse-zenoh"]
+
+
+def test_an_updater_raises_what_is_pinned_to_one_version() -> None:
+    project = tomllib.loads(Path(ROOT, "pyproject.toml").read_text())["project"]
+    linters = project["optional-dependencies"]["lint"]
+    updater = Path(ROOT, ".github/dependabot.yml").read_text()
+    assert all("==" in linter for linter in linters)
+    assert {linter.split("==")[0] for linter in linters} == set(
+        re.findall(r"- dependency-name: (\S+)", updater)
+    )
+    assert "package-ecosystem: github-actions" in updater
+
+
+def test_a_release_is_on_the_index_after_all_else_is_there() -> None:
+    """The index keeps a file for ever."""
+    text = Path(ROOT, ".github/workflows/release.yml").read_text()
+    needs = re.findall(r"^  (\w+):\n    needs: (\w+)$", text, re.M)
+    assert needs == [("files", "build"), ("publish", "files")]
+
+
 # Two clones of the present commit, in which the same files have other times and modes
 
 COMMIT = source_of(ROOT).removesuffix(DIRTY)
@@ -47,7 +136,7 @@ builds = pytest.mark.skipif(not COMMIT, reason="a release is made from a git clo
 
 @pytest.fixture(scope="module")
 def built(tmp_path_factory: pytest.TempPathFactory) -> Iterator[list[Path]]:
-    pytest.importorskip("hatch_fancy_pypi_readme", reason="only the build needs it")
+    pytest.importorskip("hatchling", reason="only the build needs it")
     made = []
     for mask in ("022", "077"):
         clone = tmp_path_factory.mktemp("clone") / "acsard"
@@ -121,15 +210,11 @@ def test_a_wheel_of_the_sdist_has_the_files_of_the_clones_wheel_and_its_commit(
 
 @builds
 @pytest.mark.slow
-def test_each_link_of_the_wheels_readme_is_absolute_and_leads_to_a_file(built: list[Path]) -> None:
+def test_the_wheels_readme_is_that_of_the_commit(built: list[Path]) -> None:
     text = metadata(the_wheel(built[0])).get_payload()
-    assert isinstance(text, str)
-    links = re.findall(r"\]\(([^)]*)\)", text)
-    assert len(links) > 20
-    for link in links:
-        assert link.startswith("https://"), link
-        if path := re.match(rf"{HOME}/blob/HEAD/([^#]*)", link):
-            assert Path(ROOT, path[1]).exists(), link
+    page = Path(ROOT, "README.md").read_text()
+    assert text == contents.with_absolute_links(page, contents.home(), COMMIT)
+    assert metadata(the_wheel(built[0]))["Description-Content-Type"] == "text/markdown"
 
 
 @builds

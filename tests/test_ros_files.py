@@ -1,5 +1,7 @@
 """The files in deploy/ros2 describe the robot to ROS with the same numbers as acsard's defaults.
 
+Those that `describe.py` writes do it with the numbers of another robot.
+
 The tests do not need ROS. They do not show that ROS itself accepts the files.
 """
 
@@ -8,7 +10,6 @@ from __future__ import annotations
 import json
 import re
 import runpy
-import shutil
 import subprocess
 import sys
 import xml.etree.ElementTree as ET
@@ -23,7 +24,19 @@ from msgspec.structs import replace
 from ruamel.yaml import YAML
 
 from acsard.core.codes import reason
-from acsard.core.config.settings import DIAGNOSTICS_HZ, BusConfig, Config, RosConfig, WheelMap
+from acsard.core.config.parsing import effective
+from acsard.core.config.settings import (
+    DIAGNOSTICS_HZ,
+    BusConfig,
+    Config,
+    DriveConfig,
+    JointsConfig,
+    LidarConfig,
+    LimitsConfig,
+    OdometryConfig,
+    RosConfig,
+    WheelMap,
+)
 from acsard.core.messages.diagnostics import diagnostics
 from acsard.core.motion.neutral import NEUTRAL_PAUSE_NS
 from acsard.core.ros.transports import ros_names
@@ -32,6 +45,7 @@ from tests import promised
 from tests.unit.examples import OUTPUTS, SNAPSHOT, changed
 
 FILES = Path(__file__).parents[1] / "deploy" / "ros2"
+LAUNCH = FILES / "acsar.launch.py"
 CONFIG = Config()
 
 
@@ -40,14 +54,34 @@ def manual(page: str) -> str:
     return (FILES.parent / f"manual/pages/{page}.md").read_text()
 
 
-WHEEL_SIGNS = {  # x and y of each wheel's position
-    CONFIG.joints.front_right: (1, -1),
-    CONFIG.joints.front_left: (1, 1),
-    CONFIG.joints.rear_left: (-1, 1),
-    CONFIG.joints.rear_right: (-1, -1),
-    CONFIG.joints.left: (0, 1),
-    CONFIG.joints.right: (0, -1),
-}
+# Another robot, of which no value that the files have is a default.
+OTHER = Config(
+    drive=DriveConfig(
+        wheel_radius=0.0825,
+        wheel_separation=0.46,
+        wheel_separation_multiplier=1.52,
+        left_wheel_radius_multiplier=1.01,
+        right_wheel_radius_multiplier=0.99,
+    ),
+    joints=JointsConfig(
+        front_right="fr_joint", front_left="fl_joint", rear_left="rl_joint", rear_right="rr_joint"
+    ),
+    limits=LimitsConfig(
+        linear_speed=0.7,
+        angular_speed=0.9,
+        linear_acceleration=0.5,
+        angular_acceleration=1.25,
+        linear_deceleration=0.8,
+        angular_deceleration=2.0,
+        wheel_speed=14.5,
+    ),
+    odometry=OdometryConfig(odom_frame="robot1/odom", base_frame="robot1/base"),
+    lidar=LidarConfig(
+        lidar_frame="robot1/laser", lidar_x_offset=0.12, lidar_y_offset=-0.03, lidar_yaw=1.5
+    ),
+)
+TWO = replace(CONFIG, mcu=replace(CONFIG.mcu, wheels=WheelMap(left="+l", right="+r")))
+
 TIMEOUTS = {source.timeout for source in CONFIG.commands.sources}
 
 
@@ -68,18 +102,37 @@ class Described(NamedTuple):
         return next(j for j in joints if find_only(j, "child").get("link") == link)
 
 
-@pytest.fixture(scope="module", params=["four wheels", "two wheels"])
+@pytest.fixture(scope="module", params=["four wheels", "two wheels", "another robot"])
 def robot(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Described:
-    """Return a robot with four driven wheels, or with two after the command of the manual."""
+    """Return the robot of the defaults, or one whose files `describe.py` has written."""
     if request.param == "four wheels":
         return Described(CONFIG, FILES)
-    wheels = WheelMap(left="+l", right="+r")
-    files = tmp_path_factory.mktemp("two")
-    for name in ("acsar.urdf", "controllers.yaml"):
-        shutil.copy(FILES / name, files)
-    (command,) = re.findall(r"^sed .+$", manual("howto/two-wheels"), re.M)
-    subprocess.run(["sh", "-c", command], cwd=files, check=True, timeout=20)
-    return Described(replace(CONFIG, mcu=replace(CONFIG.mcu, wheels=wheels)), files)
+    config = TWO if request.param == "two wheels" else OTHER
+    where = tmp_path_factory.mktemp("described")
+    (where / "robot.json").write_bytes(msgspec.json.encode(effective(config)))
+    words = [sys.executable, str(FILES / "describe.py"), "robot.json", "my_robot"]
+    subprocess.run(words, cwd=where, check=True, timeout=20)
+    assert (where / "my_robot/acsar.launch.py").read_text() == LAUNCH.read_text()
+    return Described(config, where / "my_robot")
+
+
+def side_of(config: Config, joint: str) -> int:
+    """Return the sign of a wheel's y."""
+    joints = config.joints
+    return 1 if joint in (joints.front_left, joints.rear_left, joints.left) else -1
+
+
+def end_of(config: Config, joint: str) -> int:
+    """Return the sign of a wheel's x."""
+    joints = config.joints
+    if joint in (joints.left, joints.right):
+        return 0
+    return 1 if joint in (joints.front_left, joints.front_right) else -1
+
+
+def link(frame: str) -> str:
+    """Return the link of the URDF, to which robot_state_publisher adds `frame_prefix`."""
+    return frame.rpartition("/")[2]
 
 
 def find_only(element: ET.Element, path: str) -> ET.Element:
@@ -117,36 +170,42 @@ def published_names(direction: str) -> set[str]:
 
 
 def test_each_wheel_touches_the_floor_at_half_the_wheel_separation(robot: Described) -> None:
-    radius, half = CONFIG.drive.wheel_radius, CONFIG.drive.wheel_separation / 2
+    drive = robot.config.drive
+    radius, half = drive.wheel_radius, drive.wheel_separation / 2
     wheels = [j.get("name") for j in robot.urdf().findall("joint[@type='continuous']")]
     assert tuple(wheels) == robot.config.joint_names
     for name in robot.config.joint_names:
         joint = robot.joint(name)
-        assert find_only(joint, "parent").get("link") == CONFIG.odometry.base_frame
+        assert find_only(joint, "parent").get("link") == link(robot.config.odometry.base_frame)
         x, y, z = numbers(find_only(joint, "origin").get("xyz"))
-        assert (y, z) == pytest.approx((WHEEL_SIGNS[name][1] * half, radius))
-        assert (x > 0) - (x < 0) == WHEEL_SIGNS[name][0]
+        assert (y, z) == pytest.approx((side_of(robot.config, name) * half, radius))
+        assert (x > 0) - (x < 0) == end_of(robot.config, name)
         assert numbers(find_only(joint, "axis").get("xyz")) == [0, 1, 0]
         limit = find_only(joint, "limit").get("velocity")
-        assert numbers(limit) == [CONFIG.limits.wheel_speed]
+        assert numbers(limit) == [robot.config.limits.wheel_speed]
+    tyres = robot.urdf().findall("link//cylinder[@length='0.04'][@radius]")
+    radii = {tyre.get("radius") for tyre in tyres} - {"0.035"}  # the lidar's
+    assert radii == {f"{radius:g}"}
 
 
 def test_each_link_has_a_joint_to_it_and_none_is_left_over(robot: Described) -> None:
     links = {link.get("name") for link in robot.urdf().findall("link")}
     joints = robot.urdf().findall("joint")
     children = [find_only(joint, "child").get("link") for joint in joints]
-    assert sorted([*map(str, children), CONFIG.odometry.base_frame]) == sorted(map(str, links))
+    root = link(robot.config.odometry.base_frame)
+    assert sorted([*map(str, children), root]) == sorted(map(str, links))
 
 
 def test_lidar_and_footprint_frames_agree_with_the_configuration(robot: Described) -> None:
-    lidar = CONFIG.lidar
-    for link, xyz, rpy in (
-        (lidar.lidar_frame, [lidar.lidar_x_offset, lidar.lidar_y_offset, 0],
+    lidar = robot.config.lidar
+    for name, xyz, rpy in (
+        (link(lidar.lidar_frame), [lidar.lidar_x_offset, lidar.lidar_y_offset, 0],
          [0, 0, lidar.lidar_yaw]),
         ("base_footprint", [0, 0, 0], [0, 0, 0]),
     ):  # fmt: skip
-        fixed_joint = robot.joint_to(link)
-        assert find_only(fixed_joint, "parent").get("link") == CONFIG.odometry.base_frame
+        fixed_joint = robot.joint_to(name)
+        root = link(robot.config.odometry.base_frame)
+        assert find_only(fixed_joint, "parent").get("link") == root
         assert numbers(find_only(fixed_joint, "origin").get("xyz")) == xyz
         assert numbers(find_only(fixed_joint, "origin").get("rpy")) == rpy
 
@@ -172,17 +231,18 @@ def test_ros2_control_has_what_the_topic_hardware_needs(robot: Described) -> Non
 
 def test_the_controller_has_the_dimensions_and_limits_of_the_robot(robot: Described) -> None:
     parameters = ros_parameters("controllers.yaml", "/**/diff_drive_controller", robot.files)
-    names, drive, limits = robot.config.joint_names, CONFIG.drive, CONFIG.limits
+    config, names = robot.config, robot.config.joint_names
+    drive, limits = config.drive, config.limits
     wanted = {
-        "left_wheel_names": [name for name in names if "left" in name],
-        "right_wheel_names": [name for name in names if "right" in name],
+        "left_wheel_names": [name for name in names if side_of(config, name) > 0],
+        "right_wheel_names": [name for name in names if side_of(config, name) < 0],
         "wheel_separation": drive.wheel_separation,
         "wheel_radius": drive.wheel_radius,
         "wheel_separation_multiplier": drive.wheel_separation_multiplier,
         "left_wheel_radius_multiplier": drive.left_wheel_radius_multiplier,
         "right_wheel_radius_multiplier": drive.right_wheel_radius_multiplier,
-        "odom_frame_id": CONFIG.odometry.odom_frame,
-        "base_frame_id": CONFIG.odometry.base_frame,
+        "odom_frame_id": config.odometry.odom_frame,
+        "base_frame_id": config.odometry.base_frame,
         "enable_odom_tf": False,
         "linear.x.max_velocity": limits.linear_speed,
         "linear.x.min_velocity": -limits.linear_speed,
@@ -204,9 +264,9 @@ def test_the_controller_has_the_dimensions_and_limits_of_the_robot(robot: Descri
 # nav2_params.yaml
 
 
-def test_nav2_moves_within_the_limits() -> None:
-    limits = CONFIG.limits
-    smoother = ros_parameters("nav2_params.yaml", "velocity_smoother")
+def test_nav2_moves_within_the_limits(robot: Described) -> None:
+    limits = robot.config.limits
+    smoother = ros_parameters("nav2_params.yaml", "velocity_smoother", robot.files)
     fastest = [limits.linear_speed, 0, limits.angular_speed]
     accelerations = [limits.linear_acceleration, 0, limits.angular_acceleration]
     decelerations = [limits.linear_deceleration, 0, limits.angular_deceleration]
@@ -215,13 +275,30 @@ def test_nav2_moves_within_the_limits() -> None:
     assert smoother["max_accel"] == accelerations
     assert smoother["max_decel"] == [-a for a in decelerations]
     assert {smoother["velocity_timeout"]} == TIMEOUTS
-    follow = ros_parameters("nav2_params.yaml", "controller_server")["FollowPath"]
+    follow = ros_parameters("nav2_params.yaml", "controller_server", robot.files)["FollowPath"]
     assert (follow["vx_max"], follow["wz_max"]) == (limits.linear_speed, limits.angular_speed)
     assert (follow["ax_max"], follow["az_max"]) == (accelerations[0], accelerations[2])
     assert follow["ax_min"] == -limits.linear_deceleration
-    behaviors = ros_parameters("nav2_params.yaml", "behavior_server")
+    behaviors = ros_parameters("nav2_params.yaml", "behavior_server", robot.files)
     assert behaviors["max_rotational_vel"] <= limits.angular_speed
     assert behaviors["rotational_acc_lim"] <= limits.angular_acceleration
+
+
+def test_nav2_has_the_frames_and_the_outline_of_the_robot(robot: Described) -> None:
+    odom, base = robot.config.odometry.odom_frame, robot.config.odometry.base_frame
+    found: dict[str, set[Any]] = {}
+    for key, value in leaves(yaml("nav2_params.yaml", robot.files)):
+        found.setdefault(key, set()).add(str(value))
+    below = f"{base.removesuffix(link(base))}base_footprint"
+    assert found["base_frame_id"] == {below}
+    assert found["robot_base_frame"] == found["base_frame"] == {base}
+    assert found["odom_frame_id"] == found["local_frame"] == found["fixed_frame"] == {odom}
+    assert found["global_frame"] == {odom, "map"}
+    (footprint,) = found["footprint"]
+    corners = json.loads(footprint)
+    half = robot.config.drive.wheel_separation / 2 + 0.02
+    length = max(0.17, 0.12 + robot.config.drive.wheel_radius)
+    assert [abs(n) for corner in corners for n in corner] == pytest.approx(4 * [length, half])
 
 
 def test_nav2_commands_often_enough() -> None:
@@ -282,9 +359,9 @@ def leaves(tree: dict[str, Any]) -> list[tuple[str, Any]]:
 # ekf.yaml
 
 
-def test_the_ekf_takes_the_speeds_of_each_sample_in_the_robot_s_frames() -> None:
-    ekf = ros_parameters("ekf.yaml", "ekf_filter_node")
-    frames = CONFIG.odometry.odom_frame, CONFIG.odometry.base_frame
+def test_the_ekf_takes_the_speeds_of_each_sample_in_the_robot_s_frames(robot: Described) -> None:
+    ekf = ros_parameters("ekf.yaml", "/**/ekf_filter_node", robot.files)
+    frames = robot.config.odometry.odom_frame, robot.config.odometry.base_frame
     assert (ekf["odom_frame"], ekf["base_link_frame"]) == frames
     assert (ekf["world_frame"], ekf["publish_tf"]) == (ekf["odom_frame"], True)
     assert f"/{ekf['odom0']}" in published_names("out")
@@ -298,11 +375,14 @@ def test_the_ekf_takes_the_speeds_of_each_sample_in_the_robot_s_frames() -> None
 # acsar.launch.py
 
 
-def launched(namespace: str, monkeypatch: pytest.MonkeyPatch) -> dict[str, dict[str, Any]]:
+def launched(
+    namespace: str, monkeypatch: pytest.MonkeyPatch, **arguments: str
+) -> dict[str, dict[str, Any]]:
     """Run the launch file with stand-ins for ROS's `launch` and `launch_ros`.
 
     Returns the launched nodes, keyed by executable.
     """
+    given = {"namespace": namespace} | arguments
     modules = ("launch", "launch.actions", "launch.conditions", "launch.substitutions")
     for module in (*modules, "launch_ros", "launch_ros.actions"):
         monkeypatch.setitem(sys.modules, module, MagicMock())
@@ -312,9 +392,9 @@ def launched(namespace: str, monkeypatch: pytest.MonkeyPatch) -> dict[str, dict[
     monkeypatch.setattr(
         sys.modules["launch.substitutions"],
         "LaunchConfiguration",
-        lambda name: MagicMock(perform=lambda context: namespace),
+        lambda name: MagicMock(perform=lambda context: given.get(name, "")),
     )
-    launch = runpy.run_path(str(FILES / "acsar.launch.py"))
+    launch = runpy.run_path(str(LAUNCH))
     launch["generate_launch_description"]()
     return {node["executable"]: node for node in launch["nodes"](MagicMock())}
 
@@ -371,6 +451,24 @@ def test_ros2_control_uses_the_robot_s_joint_topics_in_the_right_direction(
         assert ours.get(topic) == direction, topic
     for topic in ("/tf", "/tf_static"):
         assert resolved(topic, namespace, manager["remappings"]) == f"{prefix}{topic}"
+
+
+def test_two_robots_with_a_frame_prefix_share_one_tree(monkeypatch: pytest.MonkeyPatch) -> None:
+    nodes = launched("robot1", monkeypatch, frame_prefix="robot1/")
+    publisher = nodes["robot_state_publisher"]
+    assert publisher["parameters"][0]["frame_prefix"] == "robot1/"
+    for name in ("robot_state_publisher", "rviz2"):
+        assert resolved("/tf", "robot1", nodes[name]["remappings"]) == "/tf"
+    page = manual("howto/ros-tools")
+    assert "frame_prefix:=robot1/" in page
+    assert "topic_tools relay /robot1/tf /tf" in page
+
+
+def test_only_a_bag_has_another_clock_than_the_host(monkeypatch: pytest.MonkeyPatch) -> None:
+    for given, value in (({}, False), ({"use_sim_time": "true"}, True)):
+        for name, node in launched("", monkeypatch, **given).items():
+            if name != "spawner":
+                assert {"use_sim_time": value} in node["parameters"], name
 
 
 # zenoh-bridge-ros2dds.json5

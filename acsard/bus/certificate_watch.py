@@ -11,12 +11,14 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Callable, Iterable, Mapping, MutableMapping
 from pathlib import Path
+from typing import NamedTuple
 
 from acsard.bus.tls_files import expiry_times, peer_ends_ns, unusable
 from acsard.bus.tls_trouble import RENEW_ADVICE
 from acsard.bus.zenoh_sessions import certificate_trouble
+from acsard.core.codes import Code
 from acsard.core.config.settings import BusConfig
-from acsard.core.messages.certificate_expiry import expiry, short_code
+from acsard.core.messages.certificate_expiry import expiry, short_code, urgency
 from acsard.core.values import NS_PER_S, Event, WallNs
 from acsard.host import clock
 from acsard.host.threads import NoThreadError, in_thread
@@ -87,14 +89,14 @@ async def watch_certificates(
 ) -> None:
     """Update the expiry times in `known` every `EXPIRY_CHECK_PERIOD_S` until cancelled.
 
-    Tells when one of them begins to be near, or is over.
+    Tells when the first of them comes below each of `EXPIRY_DAYS`, and when it is over.
 
     Its keys are those of `tls.expiry_times` and `router_expiry_times`. A value stays if a
     certificate cannot be read. With `bus.outside`, the TLS gateway reports the robot's own
     certificate.
     """
     routers = bus.tls_routers
-    answered, reading, said = 0, 0, ""
+    answered, reading, said = 0, 0, _Said("certificate_valid", 0)
     while True:
         expiries: dict[str, int] = {}
         try:
@@ -115,11 +117,20 @@ async def watch_certificates(
         await asyncio.sleep(EXPIRY_CHECK_PERIOD_S)
 
 
-def _tell_of_change(known: Mapping[str, WallNs], said: str, tell: Callable[[Event], None]) -> str:
+class _Said(NamedTuple):
+    code: Code
+    urgency: int
+
+
+def _tell_of_change(
+    known: Mapping[str, WallNs], said: _Said, tell: Callable[[Event], None]
+) -> _Said:
     if not known:
         return said
-    why = expiry(known, clock.now().wall_ns, RENEW_ADVICE)
-    if why.code != said and why.level != "ok":
+    now_ns = clock.now().wall_ns
+    why = expiry(known, now_ns, RENEW_ADVICE)
+    now = _Said(why.code, urgency(known, now_ns))
+    if now != said and why.level != "ok":
         text = f"{why.text}; {why.advice}"
         tell(Event("certificate", text, "warning", kind=short_code(why), code=why.code))
-    return why.code
+    return now

@@ -11,6 +11,7 @@ import re
 import sys
 import time
 from collections.abc import Iterator, Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from acsard.bus.address import address_of
@@ -81,6 +82,13 @@ def _add_token(parser: argparse.ArgumentParser) -> None:
         type=_name,
         help="name of the token, for example the name of the person who gets it (default: the "
         "role)",
+    )
+    parser.add_argument(
+        "--token",
+        type=Path,
+        metavar="FILE",
+        help="let in a program that has this token, so that one program reads many robots; the "
+        "file has what `openssl rand -hex 32` prints (default: a new token, in a link)",
     )
     lasting = parser.add_mutually_exclusive_group()
     lasting.add_argument(
@@ -179,17 +187,28 @@ def main_invite(args: argparse.Namespace) -> int:
         )
     vault = _vault(args, config)
     days = 0 if args.hours else args.days or DEFAULT_DAYS
-    text, token = vault.invite(args.role, args.name or args.role, days, args.hours or 0)
+    shared = _text_in(args.token) if args.token else ""
+    text, token = vault.invite(args.role, args.name or args.role, days, args.hours or 0, shared)
     until = f"{_clock(token.ends)}, for {lasting(token.ends - token.made)}"
-    print(f"{token.name} is {token.role} until {until}; the link is not shown again:\n")
-    for url in urls:
-        print(f"  {url}#token={text}")
-    print()
-    segno.make(f"{urls[0]}#token={text}", error="l").terminal(sys.stdout, compact=True)
-    print(f"\nto revoke the token before that: acsard web revoke {token.name}")
+    if shared:
+        print(f"{token.name} is {token.role} until {until}, with the token in {args.token}, at:\n")
+        print("".join(f"  {url}\n" for url in urls))
+    else:
+        print(f"{token.name} is {token.role} until {until}; the link is not shown again:\n")
+        print("".join(f"  {url}#token={text}\n" for url in urls))
+        segno.make(f"{urls[0]}#token={text}", error="l").terminal(sys.stdout, compact=True)
+        print()
+    print(f"to revoke the token before that: acsard web revoke {token.name}")
     if unknown := vault.unknown_to():
         print(unknown)
     return Exit.OK
+
+
+def _text_in(file: Path) -> str:
+    try:
+        return file.read_text(errors="replace").strip()
+    except OSError as error:
+        raise UsageError(f"cannot read {file}: {error.strerror}") from None
 
 
 def _vault(args: argparse.Namespace, config: Config) -> Vault:

@@ -11,6 +11,7 @@ import fcntl
 import hashlib
 import math
 import os
+import re
 import secrets
 import time
 from collections.abc import Iterable, Iterator
@@ -35,6 +36,9 @@ SERVICE_DIRECTORY = Path("/var/lib/acsard-web")
 
 # Of the time in the token file: more writes would wear out an SD card.
 TIME_PERIOD_S = 60
+
+# As long as the 32 random bytes of a new token.
+_TEXT = re.compile(r"[A-Za-z0-9_-]{43,128}")
 
 
 class Token(Struct, frozen=True):
@@ -95,11 +99,19 @@ class Vault:
             "does not read: to invite users to the page of that service, run this command with sudo"
         )
 
-    def invite(self, role: Role, name: str, days: int, hours: int = 0) -> tuple[str, Token]:
+    def invite(
+        self, role: Role, name: str, days: int, hours: int = 0, text: str = ""
+    ) -> tuple[str, Token]:
         """Create a token, and return its text, which is stored nowhere, and its record.
 
-        Raises `UsageError` for a name in use.
+        `text` is that of a token which several robots share; without it the token gets a new one.
+        Raises `UsageError` for a name or a text in use, and for a text that a stranger may guess.
         """
+        if text and not _TEXT.fullmatch(text):
+            raise UsageError(
+                "a token has 43 to 128 characters of A-Z a-z 0-9 _ and -, at random: make one with "
+                "`openssl rand -hex 32`"
+            )
         with self._changing() as rows:
             now_s = int(self.now_s())
             if any(record.name == name for record in self._own(rows)):
@@ -107,7 +119,12 @@ class Vault:
                     f"the token {name} exists already: either give another --name, or revoke the "
                     f"old token with `acsard web revoke {name}`"
                 )
-            text = secrets.token_urlsafe(32)
+            text = text or secrets.token_urlsafe(32)
+            if used := [one.name for one in self._own(rows) if one.digest == _digest(text)]:
+                raise UsageError(
+                    f"this token is on the robot already, as {used[0]}: revoke that one first with "
+                    f"`acsard web revoke {used[0]}`"
+                )
             ends = now_s + 3600 * (24 * days + hours)
             token = Token(name, role, _digest(text), now_s, ends, self.robot)
             rows.append(asdict(token))

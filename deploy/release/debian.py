@@ -82,7 +82,8 @@ SHELL_FILES = {
     "acsard.fish": "fish/vendor_completions.d/acsard.fish",
     "acsard.1": "man/man1/acsard.1.gz",
 }
-MAINTAINER = "acsard maintainers <acsard@maintainers.invalid>"
+# Who maintains the package, until `maintainers` of `[project]` in pyproject.toml says it.
+NOBODY = "acsard maintainers <acsard@maintainers.invalid>"
 
 
 RELEASES = (Release(12, "bookworm", "3.11"), Release(13, "trixie", "3.13"))
@@ -150,6 +151,7 @@ class Contents:
         self._lib = self._home / "lib"
         self._locked = _downloaded(python.release.python, machine, work / "wheels")
         self._wheels = _closure(wheel, self._locked, python.release.python, machine)
+        self._maintainer = _metadata(self._wheels[0])["Maintainer-email"] or NOBODY
         for item in self._wheels:
             _unpack(item, self._lib, work / "scripts")
         for pattern in UNUSED_FILES:
@@ -204,7 +206,7 @@ class Contents:
         settings = {
             "ARCHITECTURE": self._machine,
             "HOMEPAGE": _homepage(self._wheels[0]),
-            "MAINTAINER": MAINTAINER,
+            "MAINTAINER": self._maintainer,
             "PYTHON": f"python{release.python}",
             "REVISION": revision,
             "ROOT": str(self._root),
@@ -233,7 +235,7 @@ class Contents:
             documents / "changelog.Debian.gz",
             f"acsard ({debian_version}) unstable; urgency=medium\n\n"
             "  * CHANGELOG.md of the source has the changes.\n\n"
-            f" -- {MAINTAINER}  {date}\n",
+            f" -- {self._maintainer}  {date}\n",
         )
         _copy(HERE / "debian/lintian-overrides", share / "lintian/overrides/acsard")
 

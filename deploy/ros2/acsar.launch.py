@@ -3,6 +3,7 @@
 This file does not start acsard, which runs without ROS, as a service on the robot.
 
     ros2 launch ./acsar.launch.py [use_ros2_control:=true] [use_rviz:=true] [namespace:=robot1]
+        [frame_prefix:=robot1/] [use_sim_time:=true]
 """
 
 from pathlib import Path
@@ -20,7 +21,8 @@ CONTROLLERS = HERE / "controllers.yaml"
 RVIZ = HERE / "acsar.rviz"
 
 # tf2 publishes on /tf, with a leading slash. acsard and the bridge put TF into the robot's
-# namespace, like all other topics. In the root namespace these remappings change nothing.
+# namespace, like all other topics. In the root namespace these remappings change nothing. With
+# prefixed frames all robots share one tree on /tf.
 TF = [("/tf", "tf"), ("/tf_static", "tf_static")]
 
 
@@ -40,6 +42,17 @@ def generate_launch_description() -> LaunchDescription:
                 default_value="",
                 description="ROS namespace of the robot: [ros] namespace of acsard.toml",
             ),
+            DeclareLaunchArgument(
+                "frame_prefix",
+                default_value="",
+                description="the part of the frames in acsard.toml before base_link, such as "
+                "robot1/, for several robots in one tree of frames",
+            ),
+            DeclareLaunchArgument(
+                "use_sim_time",
+                default_value="false",
+                description="only for a bag with --clock: acsard has the time of its host",
+            ),
             OpaqueFunction(function=nodes),
         ]
     )
@@ -50,6 +63,9 @@ def nodes(context: LaunchContext) -> list[Node]:
     with_control = IfCondition(LaunchConfiguration("use_ros2_control"))
     with_rviz = IfCondition(LaunchConfiguration("use_rviz"))
     prefix = f"/{namespace}" if namespace else ""
+    frames = LaunchConfiguration("frame_prefix").perform(context)
+    tf = [] if frames else TF
+    clock = {"use_sim_time": LaunchConfiguration("use_sim_time").perform(context) == "true"}
     return [
         Node(
             package="robot_state_publisher",
@@ -59,9 +75,11 @@ def nodes(context: LaunchContext) -> list[Node]:
                 {
                     "robot_description": ParameterValue(description(prefix), value_type=str),
                     "publish_frequency": 50.0,
-                }
+                    "frame_prefix": frames,
+                },
+                clock,
             ],
-            remappings=TF,
+            remappings=tf,
             output="both",
         ),
         # Since Jazzy, the controller manager takes the URDF from the topic robot_description. The
@@ -71,8 +89,8 @@ def nodes(context: LaunchContext) -> list[Node]:
             package="controller_manager",
             executable="ros2_control_node",
             namespace=namespace,
-            parameters=[str(CONTROLLERS)],
-            remappings=TF,
+            parameters=[str(CONTROLLERS), clock],
+            remappings=tf,
             output="both",
             condition=with_control,
         ),
@@ -98,8 +116,9 @@ def nodes(context: LaunchContext) -> list[Node]:
             executable="rviz2",
             namespace=namespace,
             arguments=["-d", str(RVIZ)],
+            parameters=[clock],
             remappings=[
-                *TF,
+                *tf,
                 ("/odom", "odom"),
                 ("/scan", "scan"),
                 ("/robot_description", "robot_description"),

@@ -35,7 +35,7 @@ def test_a_robot_reports_the_end_of_its_routers_certificate(where: Path) -> None
         listens(router)
         tables: Tables = {"robot": {"id": "robot1"}, "bus": bus}
         with Daemon(where, config=tables, endpoint=plain), Bus(plain, robot_id="robot1") as client:
-            expiry = f"expires in 1 days (certificate of the router {endpoint})"
+            expiry = f"expires in 24 hours (certificate of the router {endpoint})"
             until(lambda: client.state()["certificate_expiry"] == expiry, 10.0, expiry)
 
 

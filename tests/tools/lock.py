@@ -5,7 +5,8 @@ the package index, including what builds it. `deploy/release/requirements.lock` 
 that make a release, which are the group `release` in `pyproject.toml`.
 
 It asks pip for each supported Python and platform, and pins the hashes of those wheels. All
-platforms get the same versions. `--check` prints the changes and writes nothing.
+platforms get the same versions. The licences that the distributions declare stand there too, for
+the SBOM. `--check` prints the changes and writes nothing.
 """
 
 from __future__ import annotations
@@ -20,7 +21,9 @@ from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from itertools import product
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
+
+from packaging.licenses import InvalidLicenseExpression, canonicalize_license_expression
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -55,8 +58,14 @@ RELEASE_HEAD = """\
 # acsard. Written by `python -m tests.tools.lock`.
 """
 
-Pins = dict[str, tuple[str, set[str]]]
-"""Maps a distribution to its version and the hashes of its wheels."""
+
+class Pin(NamedTuple):
+    version: str
+    hashes: set[str]  # of all its wheels
+    licence: str  # the comment of the lock
+
+
+Pins = dict[str, Pin]  # by distribution
 
 
 def run_requirements() -> list[str]:
@@ -85,8 +94,8 @@ def _pyproject() -> dict[str, Any]:
 
 def resolved(
     requirements: Sequence[str], python: str, machine: str, versions: dict[str, str]
-) -> dict[str, tuple[str, str]]:
-    """Return the version and hash of each distribution that pip would install on this platform.
+) -> Pins:
+    """Return each distribution that pip would install on this platform, with the hash of one wheel.
 
     `versions` maps distributions to versions that pip must use.
     """
@@ -104,34 +113,53 @@ def resolved(
 def sources(requirements: Sequence[str]) -> Pins:
     """Return the pins of the requirements without a wheel."""
     asked = [requirement for requirement in requirements if not _has_wheel(requirement)]
-    found = _reported("--no-deps", "--no-binary", ",".join(WITHOUT_WHEEL), *asked)
-    return {name: (version, {digest}) for name, (version, digest) in found.items()}
+    return _reported("--no-deps", "--no-binary", ",".join(WITHOUT_WHEEL), *asked)
 
 
-def _reported(*words: str) -> dict[str, tuple[str, str]]:
+def _reported(*words: str) -> Pins:
     pip = [sys.executable, "-m", "pip", "install", "--quiet", "--dry-run", "--report", "-"]
     done = subprocess.run(
         [*pip, "--ignore-installed", *words], stdout=subprocess.PIPE, text=True, check=True
     )
     packages: list[Any] = json.loads(done.stdout)["install"]
     return {
-        item["metadata"]["name"].lower().replace("_", "-").replace(".", "-"): (
+        item["metadata"]["name"].lower().replace("_", "-").replace(".", "-"): Pin(
             item["metadata"]["version"],
-            item["download_info"]["archive_info"]["hashes"]["sha256"],
+            {item["download_info"]["archive_info"]["hashes"]["sha256"]},
+            licence(item["metadata"]),
         )
         for item in packages
     }
 
 
+def licence(metadata: dict[str, Any]) -> str:
+    """Return the comment with the licence of a distribution.
+
+    It is an SPDX expression if the distribution declares one, and otherwise the names of its
+    classifiers, which may leave open which BSD licence it is.
+    """
+    for said in (metadata.get("license_expression"), metadata.get("license")):
+        try:
+            return f"# licence: {canonicalize_license_expression(said or '')}"
+        except InvalidLicenseExpression:
+            continue
+    classifiers = [item for item in metadata["classifier"] if item.startswith("License ::")]
+    names = [item.rpartition(" :: ")[2] for item in classifiers]
+    assert names, f"{metadata['name']} declares no licence that this pip reads; take a newer pip"
+    return f"# licence, by name: {', '.join(names)}"
+
+
 def pins(requirements: Sequence[str], machines: Sequence[str], held: Pins) -> Pins:
     """Return the pins of these requirements and all that they need; `held` keeps its versions."""
-    versions = {name: version for name, (version, _) in held.items()}
+    versions = {name: pin.version for name, pin in held.items()}
     hashes: defaultdict[str, set[str]] = defaultdict(set)
+    licences: dict[str, str] = {}
 
-    def take(found: dict[str, tuple[str, str]]) -> None:
-        for name, (version, digest) in found.items():
-            assert versions.setdefault(name, version) == version, name
-            hashes[name].add(digest)
+    def take(found: Pins) -> None:
+        for name, pin in found.items():
+            assert versions.setdefault(name, pin.version) == pin.version, name
+            hashes[name] |= pin.hashes
+            licences[name] = pin.licence
 
     # Resolve for the oldest Python first: no other Python gets a version that it cannot install.
     first, *others = product(PYTHONS, machines)
@@ -140,15 +168,15 @@ def pins(requirements: Sequence[str], machines: Sequence[str], held: Pins) -> Pi
     with ThreadPoolExecutor(8) as pool:  # pip mostly waits for the index
         for found in pool.map(lambda item: resolved(requirements, item[0], item[1], fixed), others):
             take(found)
-    return {name: (versions[name], hashes[name]) for name in sorted(hashes)}
+    return {name: Pin(versions[name], hashes[name], licences[name]) for name in sorted(hashes)}
 
 
 def lines(pinned: Pins) -> str:
     """Return the pins as lines of a lock file."""
     text = ""
-    for name, (version, hashes) in pinned.items():
-        digests = "".join(f" \\\n    --hash=sha256:{digest}" for digest in sorted(hashes))
-        text += f"{name}=={version}{digests}\n"
+    for name, pin in pinned.items():
+        digests = "".join(f" \\\n    --hash=sha256:{digest}" for digest in sorted(pin.hashes))
+        text += f"{pin.licence}\n{name}=={pin.version}{digests}\n"
     return text
 
 

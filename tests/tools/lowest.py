@@ -13,7 +13,7 @@ from pathlib import Path
 
 PYPROJECT = Path(__file__).resolve().parents[2] / "pyproject.toml"
 
-BOUND = re.compile(r"^([A-Za-z0-9-]+)>=([0-9.]+)")
+BOUND = re.compile(r"^([A-Za-z0-9-]+)[>=]=([0-9.]+)")
 
 
 def lowest() -> dict[str, str]:

@@ -7,6 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from msgspec.structs import replace
 
 from acsard.bus import certificate_watch as module
 from acsard.bus.certificate_watch import (
@@ -16,9 +17,12 @@ from acsard.bus.certificate_watch import (
 )
 from acsard.bus.tls_files import expiry_times, files_in
 from acsard.core.config.settings import BusConfig
-from acsard.core.values import Event
+from acsard.core.messages.certificate_expiry import DAY_NS, expiry
+from acsard.core.messages.state_warnings import brief, warnings
+from acsard.core.values import Event, Instant
 from acsard.host import clock
 from acsard.machine.authority import Authority
+from tests.unit.test_page_metrics import STATE
 
 
 class Files:
@@ -106,3 +110,46 @@ async def test_new_files_and_a_new_router_are_noticed_and_missing_ones_change_no
     assert "acsard tls renew" in events[1].text
     assert f"(certificate of the router {ROUTER})" in events[1].text
     task.cancel()
+
+
+async def test_the_log_and_the_fleet_say_30_7_and_1_days_before_without_a_restart(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    Authority.make(tmp_path, "test", 400).issue(tmp_path, "robot", [], 100)
+    known = expiry_times(str(tmp_path))
+    left = 31.0
+    monkeypatch.setattr(
+        clock, "now", lambda: Instant(mono_ns=0, wall_ns=known[""] - int(left * DAY_NS))
+    )
+    monkeypatch.setattr(module, "EXPIRY_CHECK_PERIOD_S", 0.0)
+    events: list[Event] = []
+    readings = 0
+
+    def read(tls: str) -> dict[str, int]:
+        nonlocal readings
+        readings += 1
+        return {}
+
+    monkeypatch.setattr(module, "expiry_times", read)
+    bus = BusConfig(tls=str(tmp_path))
+    task = asyncio.create_task(watch_certificates(bus, known, events.append))
+    fleet = {}
+    for left in (31.0, 29.9, 20.0, 7.1, 6.9, 1.5, 0.9, 0.1, -0.1):
+        before = readings
+        await until(lambda: readings > before + 2)  # noqa: B023
+        why = expiry(known, clock.now().wall_ns)
+        state = replace(STATE, certificate=short_code(why), certificate_expiry=why.text)
+        fleet[left] = brief(warnings(state)).removeprefix("WARNING: certificate ")
+    task.cancel()
+    assert [event.text.partition(";")[0] for event in events] == [
+        "expires in 30 days",
+        "expires in 7 days",
+        "expires in 22 hours",
+        "expired 2 hours ago: TLS refuses every client",
+    ]
+    assert fleet[31.0] == ""
+    assert (fleet[20.0], fleet[1.5], fleet[0.1]) == (
+        "expires in 20 days",
+        "expires in 36 hours",
+        "expires in 2 hours",
+    )

@@ -47,6 +47,28 @@ def test_a_token_is_valid_until_it_is_revoked(tmp_path: Path) -> None:
     assert found.token not in digests(server)
 
 
+def test_one_token_may_open_the_pages_of_many_robots(tmp_path: Path) -> None:
+    text = 32 * "a5"
+    for robot in ("robot1", "robot2"):
+        vault = Vault(tmp_path / robot, robot)
+        assert vault.invite("viewer", "prometheus", 365, text=text)[0] == text
+        found = owner(vault, text)
+        assert found is not None
+        assert (found.role, found.name) == ("viewer", "prometheus")
+        assert text not in vault.path.read_text()
+    with pytest.raises(UsageError, match="already, as prometheus"):
+        vault.invite("maintainer", "other", 365, text=text)
+    vault.revoke("prometheus")
+    assert owner(vault, text) is None
+    assert owner(Vault(tmp_path / "robot1", "robot1"), text) is not None
+
+
+@pytest.mark.parametrize("text", ["password", 42 * "a", 129 * "a", 42 * "a" + "\n", 43 * "ä"])
+def test_a_token_that_a_stranger_may_guess_is_refused(tmp_path: Path, text: str) -> None:
+    with pytest.raises(UsageError, match="openssl rand -hex 32"):
+        Vault(tmp_path, "robot1").invite("viewer", "tv", 1, text=text)
+
+
 def test_the_token_itself_is_not_stored_on_the_disk(tmp_path: Path) -> None:
     vault = Vault(tmp_path / "state", "robot1")
     text, _ = vault.invite("viewer", "tv", 1)

@@ -186,7 +186,7 @@ def test_a_certificate_that_has_expired_is_a_mistake_and_one_that_soon_will_a_wa
     assert main(args) == 0
     assert "expires in 10 days; run `acsard tls renew" in capsys.readouterr().err
     authority.issue(tls, "robot", [], -1)
-    with pytest.raises(MendableError, match=r"expired 1 days ago.*acsard tls renew"):
+    with pytest.raises(MendableError, match=r"expired 24 hours ago.*acsard tls renew"):
         main(args)
 
 

@@ -8,7 +8,8 @@ from typing import Literal
 from acsard.core.codes import Reason, reason
 from acsard.core.values import NS_PER_S, WallNs
 
-EXPIRY_DAYS = 30  # remaining, below which `state` and `diagnostics` warn
+# Remaining days. Below the first, `state` and `diagnostics` warn; the log says each.
+EXPIRY_DAYS = 30, 7, 1
 
 DAY_NS = 86400 * NS_PER_S
 
@@ -30,16 +31,27 @@ def expiry(
     whose, ends_ns = first_expiry(ends)
     days = (ends_ns - now_ns) / DAY_NS
     of = f" (certificate of {whose})" if whose else ""
-    values = {"days": f"{abs(days):.0f}", "of": of, "where": where, "advice": advice}
+    values = {"span": _span(abs(days)), "of": of, "where": where, "advice": advice}
     if days < 0:
         values["of"] += _effect(ends, now_ns)
         return reason("certificate_expired", **values)
-    return reason("certificate_expires" if days < EXPIRY_DAYS else "certificate_valid", **values)
+    near = days < EXPIRY_DAYS[0]
+    return reason("certificate_expires" if near else "certificate_valid", **values)
 
 
 def short_code(why: Reason) -> str:
     """Return the `Expiry` of a finding of `expiry`."""
     return why.code.removeprefix("certificate_")
+
+
+def urgency(ends: Mapping[str, WallNs], now_ns: WallNs) -> int:
+    """Return how many of `EXPIRY_DAYS` the first expiry is below."""
+    days = (first_expiry(ends)[1] - now_ns) / DAY_NS
+    return sum(days < bound for bound in EXPIRY_DAYS)
+
+
+def _span(days: float) -> str:
+    return f"{days:.0f} days" if days >= 2.0 else f"{24.0 * days:.0f} hours"
 
 
 def _effect(ends: Mapping[str, WallNs], now_ns: WallNs) -> str:

@@ -16,12 +16,12 @@ CERTIFICATES = table(
     CertificateCode,
     """
 OK certificate_valid
-    {where}valid for {days} days{of}
+    {where}valid for {span}{of}
 WARN certificate_expires | certificate expires
-    {where}expires in {days} days{of}
+    {where}expires in {span}{of}
     -> {advice}
 FAIL certificate_expired | certificate expired
-    {where}expired {days} days ago{of}
+    {where}expired {span} ago{of}
     -> {advice}
 WARN certificate_unknown | certificate unknown
     unknown: the TLS gateway is not running, or the library that reads certificates is missing
