@@ -521,7 +521,7 @@ def row_names() -> list[str]:
         board={"emergency_stop": "released"},
     )
     rows = diagnostics(
-        config, OUTPUTS.now, snapshot, reason("certificate_valid", where="", days=365, of="")
+        config, OUTPUTS.now, snapshot, reason("certificate_valid", where="", span="365 days", of="")
     ).status
     return [row.name for row in rows]
 

@@ -491,8 +491,8 @@ FAULTS = (
           EMERGENCY_STOP, "not (pressed or self.unpowered)", "not pressed"),
     fault("wheel press",
           "a wheel that rested during a press and is then turned by hand is a runaway", WHEELS_LAW,
-          "                wheel.rest(angle, block)\n        else:",
-          "                pass\n        else:"),
+          "                wheel.rest(angle, block)\n        elif s:",
+          "                pass\n        elif s:"),
     fault("driver cut", "a fault of a motor driver stops the robot without a ramp", ROBOT,
         "            self._fault(DRIVER_FAULT_REASON, now, events)\n",
         "            self._fault(DRIVER_FAULT_REASON, now, events)\n"

@@ -36,7 +36,7 @@ def names_of(page: str, text: str) -> Iterator[str]:
     """Yield each name of a page: `settings/limits/linear_speed`, `messages/Odometry/pose`."""
     section = ""
     for line in text.splitlines():
-        if line.startswith("## "):
+        if line.startswith("## ") and page != "codes":  # a code is one word everywhere
             section = f"{line.removeprefix('## ').strip('`')}/"
         elif line.startswith("| "):
             first = re.sub(r"^\| `[A-Z]+` \| ", "", line).split(" | ")[0]  # no method of HTTP

@@ -17,7 +17,7 @@ from acsard.bus.certificate_watch import (
 )
 from acsard.bus.tls_files import expiry_times, files_in
 from acsard.core.config.settings import BusConfig
-from acsard.core.messages.certificate_expiry import DAY_NS, expiry
+from acsard.core.messages.certificate_expiry import DAY_NS, expiry, short_code
 from acsard.core.messages.state_warnings import brief, warnings
 from acsard.core.values import Event, Instant
 from acsard.host import clock
