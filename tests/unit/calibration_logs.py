@@ -40,6 +40,14 @@ def run(trip: Drive, *, gyro: bool = True, places: bool = True, name: str = "1")
     return run_of(name, streams, Notes())
 
 
+def by_headings(trip: Drive, late: float) -> Run:
+    """Return the drive with headings alone, which are late, s."""
+    at = np.arange(trip.t[0] + 0.5, trip.t[-1], 0.1)
+    yaw = np.interp(at - late, trip.t, trip.yaw)
+    streams = {"left right": (trip.t, trip.left, trip.right), "yaw": (at, yaw)}
+    return run_of("1", streams, Notes())
+
+
 def runs(drives: Iterable[Drive], *, gyro: bool = True, places: bool = True) -> list[Run]:
     return [run(trip, gyro=gyro, places=places, name=str(at)) for at, trip in enumerate(drives, 1)]
 

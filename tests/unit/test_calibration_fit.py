@@ -12,11 +12,20 @@ import numpy as np
 import pytest
 from msgspec import structs
 
-from acsard.calibration.fit import AHEAD, ASIDE, BIAS, GYRO_DELAY, POSE_DELAY, Piece, fit
+from acsard.calibration.fit import AHEAD, ASIDE, BIAS, GYRO_DELAY, POSE_DELAY, Fit, Piece, fit
 from acsard.calibration.geometry import LEFT, RIGHT, TRACK, Base
 from acsard.calibration.log import LogError, TapeReading
 from acsard.core.config.settings import Config
-from tests.unit.calibration_logs import IDEAL, WAYS, fitted, ideal, multipliers, run, usual
+from tests.unit.calibration_logs import (
+    IDEAL,
+    WAYS,
+    by_headings,
+    fitted,
+    ideal,
+    multipliers,
+    run,
+    usual,
+)
 from tests.unit.calibration_robots import (
     GUIDED,
     RADIUS,
@@ -211,6 +220,20 @@ def test_a_gyro_that_is_late_biased_and_interrupted_gives_the_same_track() -> No
     assert found.p[BIAS] == pytest.approx(0.03, abs=0.002)
     expected = multipliers(fitted(usual(), places=False))[0]
     assert multipliers(found)[0] == pytest.approx(expected, rel=0.01)
+
+
+def test_positions_that_are_late_give_the_same_track() -> None:
+    trips = [drive(Robot(late=late, rng=np.random.default_rng(3)), GUIDED) for late in (0.0, 0.3)]
+    same_but_for_a_delay(*(fitted(trip, gyro=False) for trip in trips))
+
+
+def test_headings_that_are_late_give_the_same_track() -> None:
+    same_but_for_a_delay(*(fit([by_headings(usual(), late)], Config()) for late in (0.0, 0.3)))
+
+
+def same_but_for_a_delay(prompt: Fit, late: Fit) -> None:
+    assert late.p[POSE_DELAY] - prompt.p[POSE_DELAY] == pytest.approx(0.3, abs=0.02)
+    assert multipliers(late) == pytest.approx(multipliers(prompt), rel=0.01)
 
 
 def test_a_log_without_a_sensor_beside_the_wheels_is_refused() -> None:

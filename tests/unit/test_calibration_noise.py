@@ -24,7 +24,7 @@ from acsard.calibration.result import calibrate
 from acsard.core.config.settings import Config, DriveConfig, OdometryConfig
 from acsard.core.link.feedback import Line
 from acsard.core.values import WheelSpeeds
-from tests.unit.calibration_logs import WAYS, runs
+from tests.unit.calibration_logs import WAYS, by_headings, runs
 from tests.unit.calibration_robots import (
     RADIUS,
     SEPARATION,
@@ -260,6 +260,19 @@ def test_the_noise_of_a_good_robot_is_found_and_then_stays() -> None:
     again = noise(LOG, found, stated)
     assert not again.heading_better
     assert not again.distance_better
+
+
+@pytest.mark.parametrize("way", ["gyro", "places", "headings"])
+def test_a_sensor_that_is_late_shows_no_more_noise(way: str) -> None:
+    found = []
+    for late_s in (0.0, 0.4):
+        log = Set(replace(DIFFERENTIAL, late=late_s)).log(np.random.default_rng(1))
+        driven = runs(log, gyro=way == "gyro", places=way == "places")
+        if way == "headings":
+            driven = [by_headings(trip, late_s) for trip in log]
+        found.append(noise(driven, fit(driven, Config()), OdometryConfig()))
+    prompt, late = ((each.yaw_per_metre or 0.0) + (each.yaw_per_radian or 0.0) for each in found)
+    assert 0.0 < late < 1.5 * prompt
 
 
 def test_a_gyro_alone_shows_no_noise_of_the_distance() -> None:

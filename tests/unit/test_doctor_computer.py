@@ -1,4 +1,4 @@
-"""What the kernel says about this computer."""
+"""What the kernel, and the programs that run, say about this computer."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 
 from acsard.host.kernel_counters import Conditions, Kernel, Reading, SlowClock, slow_clock
+from acsard.machine import local_findings
 from tests.unit.kernel_files import COOLER, COUNT, FIRMWARE, HWMON, POLICY, QUIET, write
 
 
@@ -62,3 +63,20 @@ def test_a_clock_is_slow_if_its_limit_is_far_below_the_full_clock(
     }
     result = slow_clock(policy)
     assert result == (None if limit is None else SlowClock(governor, limit, 1500))
+
+
+@pytest.mark.parametrize("ruled", [False, True])
+@pytest.mark.parametrize(
+    "programs", [{"brltty"}, {"ModemManager"}, {"brltty", "ModemManager"}, set()]
+)
+def test_programs_that_take_serial_ports_are_named_unless_a_rule_keeps_them_off(
+    programs: set[str], ruled: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rules = tmp_path / "70-acsar.rules"
+    if ruled:
+        rules.touch()
+    monkeypatch.setattr(local_findings, "UDEV_RULES", (str(rules),))
+    monkeypatch.setattr(local_findings, "is_running", programs.__contains__)
+    named = {each.code for each in local_findings.port_grabbers()}
+    kept_off = {"ModemManager"} if ruled else set()
+    assert named == {f"{name.lower()}_running" for name in programs - kept_off - {"x"}}

@@ -117,6 +117,22 @@ def test_the_log_has_a_viewer_s_call_under_a_readable_name(
     assert name == "alice@laptop acsard foxglove"
 
 
+@each("key", ["diagnostics", "tf_static", "state"])
+def test_a_late_viewer_gets_the_last_message_of_a_rare_key(world: World, key: str) -> None:
+    relay = world.bridge._relay
+    logged: list[bytes] = []
+    topic = full_name(world.namespace, key)
+    monitor: Any = SimpleNamespace(undeclare=lambda: None)
+    relay._followed[key] = monitor
+    out = relay._outs[topic]
+    out.last = b"the last one"
+    out.channel = cast("Any", SimpleNamespace(log=logged.append))
+    relay.follow({topic}, set())
+    assert logged == []
+    relay.follow({topic}, {topic})
+    assert logged == [b"the last one"]
+
+
 def test_an_unreadable_daemon_is_queried_once_a_second_and_reported_once(
     world: World,
 ) -> None:

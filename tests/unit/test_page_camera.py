@@ -9,7 +9,8 @@ from unittest.mock import Mock
 import pytest
 from aiohttp import StreamReader
 
-from acsard.web.camera import STREAM_ERRORS, pictures
+from acsard.web import camera as module
+from acsard.web.camera import STREAM_ERRORS, Camera, pictures
 from tests.each import each
 
 PICTURES = [bytes([0xFF, 0xD8, n]) * (n + 1) + b"\r\n--\r\n\r\n" for n in range(5)]
@@ -86,3 +87,22 @@ async def test_an_answer_that_is_not_a_stream_is_an_error() -> None:
     reader = StreamReader(Mock(_reading_paused=False), 2**16)
     with pytest.raises(ValueError, match="'text/html', not an MJPEG stream"):
         await anext(pictures("text/html", reader))
+
+
+async def test_a_picture_that_a_server_repeats_is_not_new(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Some servers repeat the last picture when their camera is lost."""
+    monkeypatch.setattr(module, "PICTURE_TIMEOUT_S", 0.01)
+    camera = Camera("http://127.0.0.1:9/")
+    camera._reading = asyncio.create_task(asyncio.sleep(60))  # the test is the stream
+    for body in (b"a", b"a", b"b", b"b", b"b"):
+        camera._take(body)
+    first = await camera.after(0)
+    assert first is not None
+    assert (first.body, first.number) == (b"b", 2)
+    camera._take(b"b")
+    assert await camera.after(first.number) is None
+    camera._take(b"a")
+    again = await camera.after(first.number)
+    assert again is not None
+    assert again.body == b"a"
+    camera.close()

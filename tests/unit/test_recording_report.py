@@ -19,10 +19,11 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from msgspec import Struct
 from msgspec.structs import replace
 
 from acsard.core.config.settings import Config, McuConfig, WheelMap
-from acsard.core.messages.schema import RobotState, Time
+from acsard.core.messages.schema import Odometry, RobotState, Time
 from acsard.core.ros.channels import BY_KEY, CMD_VEL_IN, LOG_CHANNEL
 from acsard.core.ros.shapes import LEVELS, Log, command_message
 from acsard.core.values import NS_PER_S, Twist
@@ -170,6 +171,24 @@ def test_the_summary_has_the_way_the_speed_and_the_stop() -> None:
     assert float(found[1]) == pytest.approx(1.4, abs=0.15)
     assert float(found[2]) == pytest.approx(0.5, abs=0.02)
     assert note == "60 steps are missing"
+
+
+def test_a_pose_that_is_set_is_no_way() -> None:
+    messages = [
+        each._replace(message=moved(each.message, 50.0)) if n > 0.5 * len(drive_of_two()) else each
+        for n, each in enumerate(drive_of_two())
+    ]
+    found = re.search(r"The robot drove ([\d.]+) m", report(messages, "acsar", []))
+    assert found is not None
+    assert float(found[1]) == pytest.approx(1.4, abs=0.15)
+
+
+def moved(message: Struct, by: float) -> Struct:
+    if not isinstance(message, Odometry):
+        return message
+    place = message.pose.pose.position
+    pose = replace(message.pose.pose, position=replace(place, x=place.x + by))
+    return replace(message, pose=replace(message.pose, pose=pose))
 
 
 def test_every_event_has_a_row_with_the_client_that_caused_it() -> None:

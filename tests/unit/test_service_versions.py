@@ -58,6 +58,12 @@ def test_a_newer_version_that_is_not_in_use_is_found(tmp_path: Path) -> None:
     assert versions.unused(tmp_path) == "0.3.0"
 
 
+def test_the_newest_version_has_the_highest_number_not_the_latest_files(tmp_path: Path) -> None:
+    versions_in(tmp_path, "0.10.0", "0.3.0", "0.9.1", "0.3.0.dev2+gb", "0.3.0.dev2+ga")
+    commits = ["0.3.0.dev2+gb", "0.3.0.dev2+ga"]  # they have no order but that of their files
+    assert versions.installed(tmp_path) == [*commits, "0.3.0", "0.9.1", "0.10.0"]
+
+
 def test_the_launcher_imports_from_its_own_version_also_after_a_switch(tmp_path: Path) -> None:
     for name in ("1", "2"):
         package = tmp_path / name / "lib" / "acsard"
