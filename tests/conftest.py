@@ -26,11 +26,11 @@ from tests.each import run
 pytest.register_assert_rewrite("tests.unit", "tests.scenarios", "tests.system", "tests.simulate")
 
 # There is no deadline, because a slow machine must not fail a property that holds. The examples are
-# the same in every run, so that luck never decides how a change is judged. `explore` looks for new
-# examples.
+# the same for every change, so that luck never decides how it is judged. The nightly job and
+# `explore` look for new examples.
 settings.register_profile("default", deadline=None, max_examples=10, derandomize=True)
-settings.register_profile("thorough", deadline=None, max_examples=100, derandomize=True)
-"""`pytest --hypothesis-profile thorough`, as the nightly job does."""
+settings.register_profile("thorough", deadline=None, max_examples=100)
+"""`pytest --hypothesis-profile thorough --hypothesis-seed N`, as the nightly job does."""
 settings.register_profile("explore", deadline=None, max_examples=3000)
 """`pytest --hypothesis-profile explore tests/unit`: 8 minutes, other examples each time."""
 settings.load_profile("default")

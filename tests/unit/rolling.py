@@ -417,5 +417,7 @@ def faulty(kind: Kind, seed: int, wheels: WheelMap) -> Case:
 
 def _ramp(bench: Bench, wished: Twist) -> float:
     limits, now = bench.limits, bench.motion.twist
-    linear = abs(wished.linear - now.linear) / limits.linear_acceleration
-    return max(linear, abs(wished.angular - now.angular) / limits.angular_acceleration)
+    linear = min(limits.linear_acceleration, limits.linear_deceleration)
+    angular = min(limits.angular_acceleration, limits.angular_deceleration)
+    change = abs(wished.linear - now.linear) / linear
+    return max(change, abs(wished.angular - now.angular) / angular)
