@@ -80,6 +80,22 @@ def test_wrong_counts_of_a_robot_that_goes_to_and_fro_are_not_forgotten(
         assert robot.state.mode == "driving", robot.state.reason
 
 
+@pytest.mark.variations(4)
+@pytest.mark.parametrize("turn", [0.0, 0.6])
+@pytest.mark.parametrize("seconds", [1.0, 1.5, 2.0, 2.5, 3.0])
+@pytest.mark.parametrize("wrong", [0.5, 1.6])
+@four_and_two
+def test_wrong_counts_of_a_robot_that_goes_to_and_fro_at_once_are_no_fault_of_a_wheel(
+    wrong: float, seconds: float, turn: float, wheels: WheelMap
+) -> None:
+    robot = world(3200, "on", round(3200 * wrong), wheels)
+    robot.run(0.5)
+    for _ in range(4):
+        for speed in (0.6, -0.6):
+            robot.drive(speed, turn, seconds)
+            assert robot.state.mode == "driving", robot.state.reason
+
+
 @pytest.mark.variations(6)
 @pytest.mark.parametrize("counts", [16, 96, 3200])
 @pytest.mark.parametrize("lag", [0.0, 0.05, 0.2])

@@ -868,6 +868,7 @@ class Run:
         # The daemon that has found an echo hears no line until the port is opened again.
         if self._plain and not (self.echo.on or self.half_duplex.on):
             self.damage.judge(true_ns, self._lines, self._stalled_ns == true_ns)
+        self.spread.roll(true_ns, self.product.angles())
         if snapshot.estimates:
             lies, truth = self._names, self.product.truth()
             self.pose.gyro(true_ns, self.product.gyro)

@@ -150,7 +150,7 @@ class CountsCheck(Struct):
                 known = True
         full = seconds >= WINDOW_S and max(map(abs, counted + reported)) >= WINDOW_ANGLE
         full = full and (known or over > 1.0)
-        suspected = over > 1.0 or (self.differs and not full)
+        suspected = over > 1.0 or ((self.differs or self.doubted != NONE) and not full)
         self.scaled = suspected and self._is_scaled(count)
         doubt = None
         if suspected or self.doubted != NONE:
@@ -168,9 +168,15 @@ class CountsCheck(Struct):
         return doubt
 
     def _is_scaled(self, count: float) -> bool:
-        rows = zip(self.counted, self.reported, strict=True)
-        moved = [one / other for one, other in rows if abs(other) > EDGES * count]
-        return bool(moved) and max(moved) - min(moved) < SHARE * max(moved)
+        factors = [
+            (one / other, SHARE / 2 + EDGES * count / abs(other))
+            for one, other in zip(self.counted, self.reported, strict=True)
+            if abs(other) > EDGES * count
+        ]
+        if not factors:
+            return self.scaled
+        least = max(factor - share * abs(factor) for factor, share in factors)
+        return least <= min(factor + share * abs(factor) for factor, share in factors)
 
     def _begin(self, speeds: Wheels4) -> None:
         self.begin, self.seconds, self.compared_s = speeds, 0.0, 0.0
