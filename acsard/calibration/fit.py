@@ -25,8 +25,9 @@ BIAS, SCALE, GYRO_DELAY, POSE_DELAY, AHEAD, ASIDE = range(TRACK + 1, TRACK + 7)
 GEOMETRY = slice(LEFT, TRACK + 1)
 
 # Standard deviations before a log is known: tyres and load change the radii by 2 %, and skidding
-# may double the track. The scale of a gyro has that of `odometry.gyro_scale_std`.
+# may double the track. With the scale of a bad gyro, a track would rather stay as configured.
 RADIUS_STD, TRACK_STD, DELAY_STD_S, LEVER_STD_M = 0.02, 1.0, 0.3, 0.2
+GYRO_STD = 0.004
 SIZE_STD = 0.05  # of both radii alike, if positions show them
 STEP_S = 1.0  # over which the turns of gyro and wheels are compared
 HEADING_STEP_S = 3.0  # the same of headings, for the report: an error is below half a turn
@@ -311,6 +312,7 @@ class Fit(Struct, frozen=True):
     readings: Errors | None  # rms of a person's readings, in their deviations
     sized: bool  # the log shows the size of the wheels, not only their ratio
     tracked: bool  # the log shows the track: another one fits it worse
+    gyro_std: float  # share by which the track errs because no other sensor shows the gyro's scale
 
     @property
     def better(self) -> bool:
@@ -321,7 +323,8 @@ class Fit(Struct, frozen=True):
     def shares(self) -> Floats:
         """Relative deviations of track / mean radius, right / left radius, and mean radius."""
         rows = np.array([[-0.5, -0.5, 1.0], [-1.0, 1.0, 0.0], [0.5, 0.5, 0.0]])
-        return np.asarray(np.sqrt(np.einsum("ri,ij,rj->r", rows, self.covariance, rows)))
+        squares = np.einsum("ri,ij,rj->r", rows, self.covariance, rows)
+        return np.asarray(np.sqrt(squares + np.array([self.gyro_std**2, 0.0, 0.0])))
 
 
 def fit(runs: Sequence[Run], config: Config, matches: dict[str, Match] | None = None) -> Fit:
@@ -331,7 +334,7 @@ def fit(runs: Sequence[Run], config: Config, matches: dict[str, Match] | None = 
         matches = {sensor: matched(sensor, runs, base) for sensor in sensors(runs)}
     pieces = [Piece(run, base) for run in cut(runs)]
     stds = np.array([
-        RADIUS_STD, RADIUS_STD, TRACK_STD, bias_std, max(1e-6, config.odometry.gyro_scale_std),
+        RADIUS_STD, RADIUS_STD, TRACK_STD, bias_std, GYRO_STD,
         DELAY_STD_S, DELAY_STD_S, LEVER_STD_M, LEVER_STD_M,
     ])  # fmt: skip
     problem = Problem(pieces, bias, stds)
@@ -348,7 +351,7 @@ def fit(runs: Sequence[Run], config: Config, matches: dict[str, Match] | None = 
         solution = problem.solve(whole.solve(start).p, fixed=True)
     else:
         solution = problem.solve(start)
-    return _judged(problem, solution, base)
+    return _judged(problem, solution, base, config.odometry.gyro_scale_std)
 
 
 def _start(problem: Problem, matches: dict[str, Match]) -> Floats:
@@ -370,7 +373,7 @@ def _start(problem: Problem, matches: dict[str, Match]) -> Floats:
     return p
 
 
-def _judged(problem: Problem, solution: Solution, base: Base) -> Fit:
+def _judged(problem: Problem, solution: Solution, base: Base, gyro_std: float) -> Fit:
     squares = np.zeros((2, len(problem.pieces), len(problem.sensors)))
     counts = np.zeros((len(problem.pieces), len(problem.sensors)))
     for n, piece in enumerate(problem.pieces):
@@ -407,7 +410,13 @@ def _judged(problem: Problem, solution: Solution, base: Base) -> Fit:
         solution.without, float(gain.sum()), spread, float(gain.min()), turn,
         errors.get("positions"), errors.get("tape"),
         bool({"positions", "tape"} & set(problem.sensors)), _tracked(problem, solution.p),
+        gyro_std if _by_gyro_alone(problem) else 0.0,
     )  # fmt: skip
+
+
+def _by_gyro_alone(problem: Problem) -> bool:
+    tape = any(r.quantity == "turn" for piece in problem.pieces for r in piece.run.tape)
+    return "gyro" in problem.sensors and not tape and {"gyro", "tape"} >= set(problem.sensors)
 
 
 def _tracked(problem: Problem, p: Floats) -> bool:

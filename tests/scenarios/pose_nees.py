@@ -26,6 +26,7 @@ from tests.wheels import MAPS
 CALIBRATED = OdometryConfig(
     wheel_separation_multiplier_std=0.02, wheel_radius_ratio_std=0.003, distance_scale_std=0.003,
     distance_variance_per_metre=2e-5, yaw_variance_per_metre=1e-5, yaw_variance_per_radian=7e-4,
+    gyro_scale_std=0.004,
 )  # fmt: skip
 """The robots have its errors that do not average out, and its noise of turns."""
 
@@ -60,7 +61,9 @@ def drawn(row: Row, seed: int, wheels: WheelMap) -> World:
     """Return a robot whose true track and radii differ from the configuration as it declares."""
     dice, mcu = random.Random(seed), replace(row.mcu, wheels=wheels)
     config = Config(mcu=mcu, sim=SimConfig(encoder_counts=row.counts), odometry=row.odometry)
-    gyro = ImperfectGyro(bias=0.01, noise=0.005, share=1.0 + dice.gauss(0.0, 0.004))
+    gyro = ImperfectGyro(
+        bias=0.01, noise=0.005, share=1.0 + dice.gauss(0.0, row.odometry.gyro_scale_std)
+    )
     world = World(config, gyro=gyro if row.odometry.gyro else None)
     vehicle, declared = world.mcu.vehicle, row.odometry
     ratio = dice.gauss(0.0, declared.wheel_radius_ratio_std)

@@ -1,14 +1,17 @@
-"""A link that is lost and found many times a second hides no runaway, and makes none."""
+"""A link that is lost and found many times a second hides no runaway and no lie, and makes none."""
 
 from __future__ import annotations
 
 import random
 from contextlib import nullcontext
+from functools import partial
 
 import pytest
+from msgspec.structs import replace
 
 from acsard.core.config.settings import Config, McuConfig, SimConfig, WheelMap
 from acsard.core.values import NS_PER_S
+from tests.scenarios.pose_faults import judged
 from tests.scenarios.world import World
 from tests.wheels import four_and_two
 
@@ -113,3 +116,24 @@ def test_a_sound_robot_behind_silences_latches_no_fault(seed: int, wheels: Wheel
             world.send(*wish)
             world.hold(*wish, seconds=lines * dice.uniform(0.7, 1.3))
             assert not faults(world), world.state.reason
+
+
+@pytest.mark.variations(4)
+@pytest.mark.parametrize("lines_s", [0.1, 0.3])
+@pytest.mark.parametrize("gain", [-1.0, 0.0, 0.5, 2.0])
+@four_and_two
+def test_encoders_that_lie_behind_silences_are_in_doubt(
+    gain: float, lines_s: float, wheels: WheelMap
+) -> None:
+    """Nobody knows what the board obeyed in a silence, so what was commanded may be the truth."""
+    world = flickering(3200, wheels)
+    world.run(1.3)
+    world.drive(0.4, seconds=2.0)
+    mcu, end_ns = world.mcu, world.now_ns + 8 * NS_PER_S
+    with mcu.switched(partial(replace, gains=(gain,) * len(mcu.switches.gains))):
+        while world.now_ns < end_ns and world.state.mode != "fault":
+            with mcu.fault("mute"):
+                world.hold(0.4, seconds=0.08)
+            world.hold(0.4, seconds=lines_s)
+            value, _, _ = judged(world)
+            assert value < 6.0 or world.state.pose_doubt

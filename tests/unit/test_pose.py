@@ -288,8 +288,8 @@ def test_the_wheels_give_only_the_distance_when_a_gyro_gives_the_turn(turned: An
     assert by_gyro.twist == Twist(by_wheels.twist.linear, 4.0)
     assert by_gyro.positions == by_wheels.positions
     assert gyro.odometry.travelled == pytest.approx(wheels.odometry.travelled)
-    # The gyro's scale adds 0.2 mrad to the 1e-6 of the start.
-    assert by_gyro.covariance.yawyaw - 1e-6 == pytest.approx(1e-4, rel=1e-3)
+    # The gyro's scale adds 3 % of 0.05 rad to the 1e-6 of the start.
+    assert by_gyro.covariance.yawyaw - 1e-6 == pytest.approx(1e-4 + 0.0015**2, rel=1e-3)
     gyro.use(Says(always=Turn(0.3, 1e-4, 0.7, 1e-3)))  # over a gap too
     assert gyro.fold(line(0.0, 0.0, gap=0.4)).pose.yaw == pytest.approx(0.35)
 

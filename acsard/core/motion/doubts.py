@@ -1,10 +1,10 @@
 """Holds what the wheels show otherwise than it was commanded: the pose may have it wrong.
 
-Nothing tells a motor that does not obey from an encoder that lies. So the difference of a side and
-its command is in doubt at once, whatever the verdict on its wheels will be. A delay of the motor
-gives it back by the next rest, and only that takes the doubt away. What `AGREEMENT` allows may be a
-slope or a weak motor: this is no doubt, but `state` says it while it lasts for long. Two wheels of
-a side that contradict each other are in doubt by half of their difference.
+Nothing tells a motor that does not obey from an encoder that lies. So all of the difference of a
+side and its command is in doubt at once, whatever its cause and the verdict on its wheels will be:
+in the covariance, the deviation of the distance is the difference's share of the way. A delay of
+the motor, and a slope that the robot drives up and down, give it back. A large difference is said,
+too. Two wheels of a side that contradict each other are in doubt by half of their difference.
 """
 
 from __future__ import annotations
@@ -27,9 +27,6 @@ NOISE_COUNTS = 1.5  # of an angle
 # the response time, and these counts.
 SHARE, DELAY_S, COUNTS = 0.05, 1.0, 2.0
 MEMORY_S = 30.0  # of driving
-# A delay of a motor takes at most the response time and the first time, at the fastest speed, and
-# gives all of it back by the next rest, but for the second time.
-TAKEN_S, LEFT_S = 0.6, 0.1
 
 
 class Trail(Struct):
@@ -42,11 +39,9 @@ class Trail(Struct):
     seconds: Seconds = 0.0
     recent: Rad = 0.0  # due in either direction, in `MEMORY_S`
     short: Rad = 0.0  # due minus shown, in `MEMORY_S`
-    astray: Rad = 0.0  # due minus shown, beyond `AGREEMENT`
-    largest: Rad = 0.0  # of it, since it was 0
-    total: Rad = 0.0  # due minus shown since then
-    weak: bool = False  # within it, for long: said while it lasts
-    differs: bool = False  # more than any delay explains: said until the pose is set
+    astray: Rad = 0.0  # the part of it in steps that differ by more than `AGREEMENT`
+    weak: bool = False  # more than a delay explains: said while it lasts
+    differs: bool = False  # so much beyond `AGREEMENT`: said until the pose is set
 
     def follow(self, command: RadPerS, angle: Rad, s: Seconds, lag: Seconds) -> None:
         """Add a motion to the open step."""
@@ -65,41 +60,31 @@ class Trail(Struct):
         size = max(abs(self.due), abs(self.shown))
         return self.disagrees(count) or size >= STEP_COUNTS * count or self.seconds >= STEP_S
 
-    def take(self, lag: Seconds, count: Rad) -> Rad:
-        """End the step, and return what is in doubt now, as one standard deviation."""
+    def take(self, lag: Seconds, count: Rad, *, said: bool = True) -> Rad:
+        """End the step, and return what is in doubt now, as one standard deviation.
+
+        Of a silence, nothing is `said`: the wheels may have obeyed another command in it.
+        """
         more, disagrees, size = self.due - self.shown, self.disagrees(count), abs(self.due)
+        if not said:
+            self.due = self.shown = self.seconds = 0.0
+            return more
         keep = 1.0 / (1.0 + self.seconds / MEMORY_S) if size or self.shown else 1.0
         self.recent, self.fastest = keep * self.recent + size, keep * self.fastest
         self.short = keep * self.short + more
+        self.astray = keep * self.astray + disagrees * more
         self.due = self.shown = self.seconds = 0.0
         most = SHARE * self.recent + (DELAY_S + lag) * self.fastest + COUNTS * count
         self.weak = abs(self.short) > (most / 2 if self.weak else most)
-        if self.largest:
-            self.total += more
-        if not disagrees:
-            return 0.0
-        if not self.largest:
-            self.total = more
-        self.astray += more
-        self.largest = max(self.largest, abs(self.astray))
-        self.differs |= abs(self.astray) > most
+        self.differs |= min(abs(self.astray), abs(self.short)) > most
         return more
-
-    def rest(self, lag: Seconds, count: Rad) -> None:
-        """Note that the side rests: a delay may explain all of the doubt."""
-        self.expected = self.due = self.shown = self.seconds = 0.0
-        fastest = self.fastest
-        left = min(abs(self.astray), abs(self.total)) - COUNTS * count
-        taken = self.largest - COUNTS * count
-        if left <= LEFT_S * fastest and taken <= (TAKEN_S + lag) * fastest and not self.differs:
-            self.astray = self.largest = self.total = 0.0
 
     def restart(self, speed: RadPerS) -> None:
         """Note that nobody knows what is expected of a side with this speed."""
         self.expected, self.due, self.shown, self.seconds = speed, 0.0, 0.0, 0.0
 
     def forget(self) -> None:
-        self.astray = self.largest = self.total = self.short = self.recent = 0.0
+        self.astray = self.short = self.recent = 0.0
         self.weak = self.differs = False
 
 
@@ -108,7 +93,6 @@ class Found(NamedTuple):
 
     astray: Wheels4  # of the sides
     wheels: list[tuple[SideName, Wheels4]]  # of a side whose wheels contradict each other
-    explained: bool  # a delay explains all that the sides were in doubt of
 
 
 class Doubts(Struct):
@@ -116,10 +100,12 @@ class Doubts(Struct):
     right: Trail = field(default_factory=Trail)
     # Since the last update.
     commanded: tuple[Rad, Rad] = (0.0, 0.0)  # of the left and the right side
+    before: tuple[RadPerS, RadPerS] = (0.0, 0.0)  # commanded in the last line
     rolled: Wheels4 = AT_REST
     used: Wheels4 = AT_REST  # by the pose
     seconds: Seconds = 0.0
-    unknown: bool = False  # a silence, or an emergency stop that may have cut the power
+    unknown: bool = False  # an emergency stop may have cut the power
+    silent: bool = False  # a line ended a silence
 
     @property
     def differs(self) -> bool:
@@ -128,13 +114,17 @@ class Doubts(Struct):
 
     def add(self, wheels: Wheels, rolled: Wheels4, seconds: Seconds) -> None:
         """Add a line, in which the wheels rolled by these angles."""
-        commanded = wheels.commanded
-        if commanded is None or wheels.unseen:
+        if wheels.commanded is None:
             self.unknown = True
         else:
+            now = wheels.commanded.front_left, wheels.commanded.front_right
+            before, self.before = self.before, now
             left, right = self.commanded
-            left += commanded.front_left * seconds
-            self.commanded = left, right + commanded.front_right * seconds
+            if wheels.unseen:
+                # Nobody knows which command the board obeyed in a silence.
+                self.silent = True
+                now = max(before[0], now[0], key=abs), max(before[1], now[1], key=abs)
+            self.commanded = left + now[0] * seconds, right + now[1] * seconds
         self.rolled, self.used = plus(self.rolled, rolled), plus(self.used, wheels.believed(rolled))
         if wheels.excludes:
             self.used = plus(self.used, wheels.repair)
@@ -145,30 +135,29 @@ class Doubts(Struct):
     def update(self, wheels: Wheels, lag: Seconds, count: Rad) -> Found:
         """End the open lines, and return what is in doubt now."""
         s, rolled, used = self.seconds, self.rolled, self.used
-        astray, wheels_astray, explained = AT_REST, list[tuple[SideName, Wheels4]](), s > 0.0
+        astray, wheels_astray = AT_REST, list[tuple[SideName, Wheels4]]()
         trails = (self.left, self.right)
         for trail, side, commanded in zip(trails, wheels.sides, self.commanded, strict=True):
             if s <= 0.0:
                 break
             angle = (used[side.front] + used[3 - side.front]) / 2
-            rests = all(wheels.wheels[i].rested for i in side.wheels)
-            if rests:
-                trail.rest(lag, count)
+            if all(wheels.wheels[i].rested for i in side.wheels):
+                trail.restart(0.0)
             elif self.unknown:
                 trail.restart(angle / s)
             else:
                 trail.follow(commanded / s, angle, s, lag)
-            explained = explained and rests and not trail.largest
             if side.out >= 0 or side.slip_s > 0.0:
                 half = (rolled[side.front] - rolled[side.rear]) / 2
                 wheels_astray.append((side.name, of_side(side.front, half)))
         # One side alone would be in doubt of a turn.
         if self.left.ends(count) or self.right.ends(count):
-            left, right = self.left.take(lag, count), self.right.take(lag, count)
+            left, right = (trail.take(lag, count, said=not self.silent) for trail in trails)
+            self.silent = False
             astray = right, left, left, right
         self.commanded, self.seconds, self.unknown = (0.0, 0.0), 0.0, False
         self.rolled = self.used = AT_REST
-        return Found(astray, wheels_astray, explained)
+        return Found(astray, wheels_astray)
 
     def forget(self) -> None:
         """Forget all doubts: the pose was set."""

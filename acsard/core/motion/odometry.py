@@ -179,8 +179,6 @@ class Odometry(Struct):
             if turn is not None and turn.doubt:
                 uncertainty.miss("gyro", 0.0, turn.doubt, heading)
             found = self.doubts.update(wheels, model.feedback.response_time, model.wheel_count)
-            if found.explained:
-                uncertainty.forgive()
             turns = 0.0 if turn is not None else 1.0
             if found.astray != AT_REST:
                 distance, angle = model.kinematics.moved(found.astray)

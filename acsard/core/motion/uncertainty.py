@@ -303,18 +303,6 @@ class Uncertainty(Struct):
             self._bend()
         self._publish()
 
-    def forgive(self) -> None:
-        """Take away what the wheels may have missed of their commands: it is explained."""
-        bend, none = self.bend, (0.0, 0.0)
-        for i in (MISSED["way"], MISSED["turn"]):
-            if self.columns[i] == ORIGIN:
-                continue
-            self.columns = [*self.columns]
-            self.columns[i] = bend.columns[i] = ORIGIN
-            for k in range(CAUSES):
-                bend.of_causes[CAUSES * i + k] = bend.of_causes[CAUSES * k + i] = none
-            self._publish()
-
     def set_twist(
         self, model: ErrorModel, twist: Twist, step: RadPerS, slips: bool, gyro: float | None
     ) -> None:
