@@ -161,8 +161,8 @@ def _client_certificate_error(reason: str, host: str, directory: str) -> str:
     certificate = f"{directory}/{CERTIFICATE}"
     if reason == "SSLV3_ALERT_CERTIFICATE_EXPIRED":
         return (
-            f"{host} says that {certificate} has expired or is not valid yet: if the clocks of this "
-            f"machine and of that host are right (`timedatectl`), {RENEW_ADVICE}"
+            f"{host} says that {certificate} has expired or is not valid yet: if the clocks of "
+            f"this machine and of that host are right (`timedatectl`), {RENEW_ADVICE}"
         )
     if "_ALERT_" in reason:
         return (
