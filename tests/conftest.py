@@ -98,7 +98,8 @@ def approved(request: pytest.FixtureRequest) -> Callable[[Path, str], None]:
     def compare(path: Path, text: str) -> None:
         if request.config.getoption("approve"):
             path.write_text(text, encoding="utf-8")
-        assert text == path.read_text(encoding="utf-8")
+        before = path.read_text(encoding="utf-8")
+        assert text == before, f"if this is intended: pytest --approve, then read git diff {path}"
 
     return compare
 

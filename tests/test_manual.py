@@ -15,6 +15,7 @@ import pytest
 from acsard.core.codes import CODES
 from acsard.core.messages.schema import RobotState
 from acsard.core.values import EventName
+from acsard.recording.export import OUTPUT_COLUMNS
 from acsard.web import manual
 from tests.each import each
 from tests.pages import MANUAL, ROOT, prose, text_of
@@ -98,6 +99,20 @@ def test_the_page_of_the_counters_has_each_name_that_the_product_counts() -> Non
     groups = tuple(re.findall(r"`(\w+_)<reason>`", page))
     assert len(names) > 15
     assert not {n for n in names if not n.startswith(groups) and f"`{n}`" not in page}
+
+
+def test_no_text_on_the_page_of_the_codes_ends_in_the_middle() -> None:
+    """A text whose advice stands in the next column ends in ; or : in the tables."""
+    cells = re.findall(
+        r"^\| `\w+` \| \w+ \| (.*?) \|", text_of("deploy/manual/pages/reference/codes.md"), re.M
+    )
+    assert len(cells) > 250
+    assert not [cell for cell in cells if cell.endswith((";", ":"))]
+
+
+def test_the_page_of_the_csv_form_names_each_column_that_an_export_writes() -> None:
+    page = text_of("deploy/manual/pages/reference/csv.md")
+    assert not [name for name in OUTPUT_COLUMNS if f"`{name}`" not in page]
 
 
 @pytest.fixture(scope="module")

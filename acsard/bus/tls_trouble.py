@@ -161,9 +161,8 @@ def _client_certificate_error(reason: str, host: str, directory: str) -> str:
     certificate = f"{directory}/{CERTIFICATE}"
     if reason == "SSLV3_ALERT_CERTIFICATE_EXPIRED":
         return (
-            f"{host} says that {certificate} has expired or is not valid yet: either make a new "
-            "one with `acsard tls add` on the machine that has ca-key.pem, or set the clocks of "
-            "this machine and of that host (`timedatectl`)"
+            f"{host} says that {certificate} has expired or is not valid yet: if the clocks of "
+            f"this machine and of that host are right (`timedatectl`), {RENEW_ADVICE}"
         )
     if "_ALERT_" in reason:
         return (

@@ -208,7 +208,7 @@ def _geometry(
         for e, words, factor, unit in (
             (found.turn, "a turn of 360 deg errs by", 180 / math.pi, "deg"),
             (found.place, "positions err by", 100.0, "cm"),
-            (found.readings, "your measurements are off by", 1.0, "of their usual error"),
+            (found.readings, "your measurements differ from it by", 1.0, "of their usual error"),
         ) if e is not None
     ]  # fmt: skip
     if not found.better:
@@ -233,7 +233,7 @@ def _geometry(
     settings["odometry.wheel_radius_ratio_std"] = ratio
     settings["odometry.distance_scale_std"] = scale
     yield (
-        "The log shows the size of the wheels: distances are right to "
+        "The drives show the size of the wheels: distances are right to "
         f"{scale:.2%} (standard deviation)."
         if found.sized
         else "A gyro does not show the size of the wheels, so distances are as right as "

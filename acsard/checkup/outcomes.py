@@ -237,7 +237,7 @@ SKIPPED top speed: no watchdog
     the watchdog of the board is not known to work, so the check does not turn the motors fast
     -> fix the watchdog above, and check again
 SKIPPED top speed: untested
-    no motor turned forward as commanded
+    no motor turned alone and at the commanded speed
     -> fix the motors above, and check again
 SKIPPED encoder counts: none
     the firmware sends no counts

@@ -218,10 +218,11 @@ class _Steps:
         broken = "sending damaged lines; a motor that turns now is a fault"
         self._measure(broken, lambda: damage.finding(board, turned))
         if board.repeats.encoders:
+            # Only sound motors: one whose encoder shows too little would turn far faster.
             rising = f"the motors turn up to {self._top:.1f} rad/s"
             safe = stops is not None and stops.verdict in ("PASS", "WARN")
             self._measure(
-                rising, lambda: top_speed.finding(board, turned, safe, self._top, self._radius)
+                rising, lambda: top_speed.finding(board, right, safe, self._top, self._radius)
             )
         self._take("", lambda: inputs.finding(board, operator, safety))
 

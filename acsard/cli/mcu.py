@@ -113,7 +113,9 @@ def _checked(
             # With --json, print the report before the error.
             trouble = error
         if not why:
-            found_changes = changes(findings, configured, args.port if args.write else "")
+            # A service has another working directory.
+            named = os.path.abspath(args.port) if args.port and "/" in args.port else args.port
+            found_changes = changes(findings, configured, named if args.write else "")
         if args.write and found_changes and not trouble:
             loan.outdated = True  # before the change: a signal may end the check after it
             try:

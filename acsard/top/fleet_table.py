@@ -14,6 +14,8 @@ from acsard.core.messages.state_warnings import beside_reason, brief, charge, wa
 from acsard.host.version import order
 from acsard.top.roster import Row, absence
 
+DAY_S = 86400.0
+
 # On a narrower terminal, a column is left out; BATTERY also if no robot reports one.
 COLUMNS = {
     "ROBOT": 0, "MODE": 0, "M/S": 60, "LINK": 90, "BATTERY": 70, "PLACE": 100, "VERSION": 120,
@@ -72,8 +74,16 @@ def row_cells(row: Row, newest: tuple[int, ...]) -> tuple[str, ...]:
         _place(state),
         _version(state, newest),
         rough(row.age),
-        f"{lost}, was: {_why(state)}" if lost else _why(state),
+        f"{lost}{_expired(row)}, was: {_why(state)}" if lost else _why(state),
     )
+
+
+def _expired(row: Row) -> str:
+    # TLS then closes every link to the robot, which drives no more.
+    days = row.state.certificate_days if row.state else None
+    if days is None or row.age < days * DAY_S:
+        return ""
+    return " (certificate_expired: type `acsard doctor` on the robot)"
 
 
 def _version(state: RobotState, newest: tuple[int, ...]) -> str:

@@ -57,3 +57,4 @@ def test_a_stick_that_never_sends_zero_is_named_with_what_it_sends() -> None:
     message, code = codes(world)
     assert code == "never_zero"
     assert "0.004 m/s and -0.006 rad/s" in message
+    assert "commanded by" not in message

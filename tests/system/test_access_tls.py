@@ -114,7 +114,7 @@ def test_the_certificate_directory_is_checked_before_the_network(tmp_path: Path)
         ("robot elsewhere", "client", "tls renew --address 127.0.0.1"),
         ("robot", "stranger", "did not sign the certificate of"),
         ("robot", "mixed", "authority did not sign it"),
-        ("robot", "ended", "has expired or is not valid yet"),
+        ("robot", "ended", "are right (`timedatectl`), run `acsard tls renew`"),
     ],
 )
 def test_the_error_says_what_is_wrong_with_either_certificate(

@@ -140,6 +140,8 @@ def test_motors_that_turn_too_slowly_show_the_watchdog_too(gain: float) -> None:
     checked = check("plain_only", *faults)
     assert checked["watchdog"].code in ("watchdog_right", "watchdog_unclear")
     assert checked["damaged lines"].verdict == "PASS"
+    fast = checked["top speed"].code
+    assert fast == ("top_speed_reached" if gain == 1.0 else "top_speed_untested")
     assert check("plain_only", "no_watchdog", *faults)["watchdog"].verdict == "FAIL"
 
 

@@ -107,7 +107,8 @@ def test_the_port_that_was_named_is_written_with_the_rate_it_has(
         return VirtualWire(FakeMcu(built))
 
     monkeypatch.setattr(mcu, "_wire", board)
-    words = ("--port", "/dev/acsar_mcu", "--yes", "--wheels-are-lifted", "--write", "--json")
+    words = ("--port", "./acsar_mcu", "--yes", "--wheels-are-lifted", "--write", "--json")
+    monkeypatch.chdir("/dev")
     assert called(tmp_path, *words, text="# mine\n") == 1
     assert json.loads(capsys.readouterr().out)["changes"]["mcu.port"] == "/dev/acsar_mcu"
     written = parse((tmp_path / "acsard.toml").read_bytes()).mcu

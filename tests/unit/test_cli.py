@@ -15,6 +15,7 @@ import pytest
 from msgspec.structs import replace
 
 from acsard.cli import foxglove, main, move, parser, robot_options
+from acsard.cli.command_line import VERBS
 from acsard.cli.move import _parsed
 from acsard.cli.robot_options import Silence
 from acsard.client.follower import FIRST_STATE_TIMEOUT_S
@@ -175,3 +176,12 @@ def test_an_address_of_this_machine_is_taken(text: str, address: tuple[str, int]
 def test_an_argument_that_is_not_utf_8_is_named(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["run", "--id", "a\udcff"]) == 2
     assert "an argument is not valid UTF-8: 'a\\udcff'" in capsys.readouterr().err
+
+
+def test_each_subcommand_is_called_by_a_test() -> None:
+    tests = Path(__file__).parents[1]
+    calls = "\n".join(p.read_text() for p in (tests / "unit/words/transcripts").glob("*.txt"))
+    sources = "\n".join(p.read_text() for p in tests.rglob("*.py"))
+    assert not [
+        verb for verb in VERBS if f"$ acsard {verb}" not in calls and f'"{verb}"' not in sources
+    ]

@@ -132,6 +132,7 @@ ROBOTS = {
 FLEET = [
     *(Row(name, True, state, 0.1) for name, state in ROBOTS.items()),
     Row("gone", False, replace(STATE, version="0.1.9"), 90.0),
+    Row("expired", False, replace(STATE, certificate_days=0.001), 90.0),
     Row("silent", True, STATE, 7.0, silent=True),
     Row("new", True, None, 0.1),
     Row("not-there", False, None, 0.1),

@@ -10,13 +10,19 @@ from functools import cache
 from pathlib import Path
 from typing import cast, get_args
 
+from msgspec.structs import replace
+
 import acsard
 from acsard.checkup.outcomes import OUTCOMES_BY_CODE
-from acsard.core.codes import CODES, Code, StateCode, sentence
+from acsard.core.codes import CODES, Code, StateCode, level_of, sentence
+from acsard.core.messages.schema import DiagnosticStatus, KeyValue
+from acsard.core.messages.state_warnings import warnings
 from acsard.core.tables.finding_table import Entry, code_of
 from acsard.core.tables.stop_codes import StopCode
+from acsard.machine.examination import reported
 from acsard.recording.file import SUFFIX, Recording
 from tests import recordings
+from tests.unit.screens import STATE
 
 PACKAGE = Path(acsard.__file__).parent
 
@@ -112,3 +118,12 @@ def test_every_code_is_used() -> None:
 def test_each_stop_and_each_reason_to_rest_says_what_to_do() -> None:
     for code in (*get_args(StopCode), "switched_off", "no_command"):
         assert CODES[code].advice, code
+
+
+def test_a_code_of_a_later_version_is_shown_as_it_is() -> None:
+    later = replace(STATE, code="later_reason", reason="of later", pose_doubt="later_doubt")
+    assert later.why == "of later (later_reason)"
+    assert [str(why) for why in warnings(later)] == ["pose doubtful: later_doubt"]
+    assert level_of("later_reason") == "warning"
+    row = DiagnosticStatus(2, "acsard: mode", "of later", "acsar", [KeyValue("code", "later")])
+    assert [(f.code, f.level) for f in reported((row,))] == [("later", "failure")]

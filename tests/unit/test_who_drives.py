@@ -245,8 +245,8 @@ def test_a_new_mode_and_a_new_commander_are_each_an_event() -> None:
     (event,) = told.changes(Mode.READY, nobody, why)
     assert event == Event("mode", "", kind="waiting -> ready", code="no_command")
     mode, commander = told.changes(Mode.DRIVING, by("app", "joe"), why)
-    assert (mode.text, mode.by, mode.code) == ("commanded by app", "app (joe)", "commanded")
-    assert commander == Event("commander", "", by="app (joe)", kind="no sender -> app (joe)")
+    assert (mode.text, mode.by, mode.code) == ("commanded by app", "joe", "commanded")
+    assert commander == Event("commander", "", kind="no sender -> app (joe)")
     assert said(told, Mode.DRIVING, by("app", "ann")) == [("commander", "app (joe) -> app (ann)")]
     assert said(told, Mode.DRIVING, by("nav", "a" * 1000)) == [
         ("commander", f"app (ann) -> nav ({'a' * MAX_SENDER_LENGTH})")

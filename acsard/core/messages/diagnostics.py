@@ -222,8 +222,9 @@ def _commands(config: Config, snapshot: Snapshot) -> Row:
     timeouts = {source.name: source.timeout for source in config.commands.sources}
     values = {s.name: waiting(s.waits_for).text or "driving" for s in snapshot.sources}
     values |= _counted(snapshot.state.counters, "command")
-    driver = snapshot.state.source
-    findings = [reason("commanded", source=driver) if driver else NO_COMMAND]
+    # A source may be selected, and still have to send a zero.
+    drives, source_name = snapshot.state.mode == "driving", snapshot.state.source
+    findings = [reason("commanded", source=source_name) if drives else NO_COMMAND]
     if snapshot.state.speed_limit:
         findings.append(reason("speed_limited", limit=snapshot.state.speed_limit))
     for source in snapshot.sources:

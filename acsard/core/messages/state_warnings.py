@@ -92,6 +92,8 @@ def _warnings(state: RobotState) -> Iterator[StateWarning]:
     if state.pose_doubt in CODES:
         doubt = reason(cast("PoseCode", state.pose_doubt))
         yield _warning("pose", doubt.code, joined(doubt).text)
+    elif state.pose_doubt:  # of a later version
+        yield StateWarning("pose", state.pose_doubt, "pose doubtful", state.pose_doubt)
 
 
 def _warning(what: What, code: Code, text: str = "") -> StateWarning:

@@ -105,12 +105,13 @@ class CommandEvents(Struct):
             self.commander = (choice.source, choice.sender)
         self.mode, events = mode, []
         if mode is not before:
-            why, by = (chosen(choice), _name(self.commander)) if drives else (why, "")
+            # The text has the source.
+            why, by = (chosen(choice), choice.sender[:MAX_SENDER_LENGTH]) if drives else (why, "")
             kind = f"{before} -> {mode}"
             events.append(Event("mode", why.text, by=by, kind=kind, code=why.code))
         if self.commander != last:
-            by = _name(self.commander)
-            events.append(Event("commander", "", by=by, kind=f"{_name(last)} -> {by}"))
+            kind = f"{_name(last)} -> {_name(self.commander)}"
+            events.append(Event("commander", "", kind=kind))
         return events + self._kept_waiting(mode, choice)
 
     def _kept_waiting(self, mode: Mode, choice: Choice) -> list[Event]:
