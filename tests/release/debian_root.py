@@ -149,7 +149,7 @@ def packages_of_tests(where: Path, system: str) -> Path:
 
 
 class Root:
-    """A minimal system without Python, in a directory, with /proc and /dev of this machine."""
+    """A minimal system without Python, in a directory, with this machine's /proc, /sys and /dev."""
 
     def __init__(self, path: Path, system: str) -> None:
         self.path, self.system = path, system
@@ -160,7 +160,8 @@ class Root:
         variables += ["DEBIAN_FRONTEND=noninteractive"]
         # The mounts end with the program, because they are in a mount namespace of its own.
         enter = (
-            'mount -t proc proc "$0/proc" && mount --rbind /dev "$0/dev" && exec chroot "$0" "$@"'
+            'mount -t proc proc "$0/proc" && mount --rbind /sys "$0/sys" && '
+            'mount --rbind /dev "$0/dev" && exec chroot "$0" "$@"'
         )
         words = ("env", "-i", *variables, *words)
         return ["unshare", "--mount", "sh", "-c", enter, str(self.path), *words]
