@@ -156,10 +156,8 @@ def test_a_time_measured_too_coarsely_to_judge_does_not_pass(
 @FOUR_AND_TWO
 def test_a_last_motor_that_runs_on_for_want_of_a_comma_is_stopped_with_one(config: Config) -> None:
     with Robot("comma_latched", config=config).board(rest=False) as board:
-        tokens = [f"{letter}p00.00" for letter in board.letters[:-1]] + [
-            board.letters[-1] + "p02.00"
-        ]
-        board.wire.send((",".join(tokens) + ",\r\n").encode())
+        tokens = "".join(f"{letter}p00.00," for letter in board.letters)
+        board.wire.send(tokens.removesuffix("0.00,").encode() + b"2.00,\r\n")
         board.listen(0.2)
         board.stop_motors()
         assert (board.comma, board.latched) == (True, True)
