@@ -245,8 +245,8 @@ WARN? encoder counts: coarse | about {about:.0f} per turn
     the firmware sends no counts, and its speeds jump by one count of a coarse encoder from line to
     line: unless the daemon knows the counts, the heading is wrong by several degrees after the
     robot has driven one square
-    -> write mcu.encoder_counts = the exact counts per wheel turn: the encoder's counts times the
-    gear ratio (two channels give four counts for each pulse)
+    -> write mcu.encoder_counts = the exact counts that the firmware makes per wheel turn: its
+    COUNTS_PER_TURN, or the pulses times the gear ratio times the edges of a pulse that it counts
 SKIPPED encoder counts: damaged
     {share:.1%} of the lines are lost, so the counts of the rest cannot be measured
     -> fix the lost lines above, and check again

@@ -1,4 +1,4 @@
-"""Makes the Debian packages of a wheel: for Debian 12 and 13, each for amd64 and arm64.
+"""Makes the packages of a wheel for Debian 12 and 13 and Ubuntu 24.04, each for amd64 and arm64.
 
     python deploy/release/debian.py WHEEL DIRECTORY
 
@@ -6,8 +6,8 @@ A package contains acsard, the locked versions of its libraries and their byteco
 installation needs no network and runs no pip. The same wheel gives the same bytes.
 
 It needs an amd64 computer, but not root. `requirements.lock` has the Python packages, and Debian's
-are mmdebstrap, binutils and binutils-aarch64-linux-gnu. The bytecode comes from the Python of the
-Debian release that the package is for: mmdebstrap unpacks it, and its own loader runs it.
+are mmdebstrap, binutils, binutils-aarch64-linux-gnu and ubuntu-keyring. The bytecode comes from the
+Python of the system that the package is for: mmdebstrap unpacks it, and its own loader runs it.
 """
 
 from __future__ import annotations
@@ -66,11 +66,12 @@ UNUSED_FILES = (
 
 
 class Release(NamedTuple):
-    """A Debian release, and the minor version of its Python."""
+    """A release of Debian or Ubuntu, the minor version of its Python, and its source for apt."""
 
-    number: int
+    name: str
     suite: str
     python: str
+    source: str = "http://deb.debian.org/debian"
 
 
 UNITS = ("acsard.service", "acsard-gateway.service", "acsard-web.service")
@@ -86,7 +87,16 @@ SHELL_FILES = {
 NOBODY = "acsard maintainers <acsard@maintainers.invalid>"
 
 
-RELEASES = (Release(12, "bookworm", "3.11"), Release(13, "trixie", "3.13"))
+UBUNTU = (
+    "deb [signed-by=/usr/share/keyrings/ubuntu-archive-keyring.gpg] "
+    "http://archive.ubuntu.com/ubuntu noble main"
+)
+
+RELEASES = (
+    Release("deb12", "bookworm", "3.11"),
+    Release("deb13", "trixie", "3.13"),
+    Release("ubuntu24.04", "noble", "3.12", UBUNTU),
+)
 
 
 def debs(wheel: Path, out: Path) -> list[Path]:
@@ -107,14 +117,14 @@ def debs(wheel: Path, out: Path) -> list[Path]:
 
 
 class Python:
-    """The Python of a Debian release, in a directory."""
+    """The Python of a release of Debian or Ubuntu, in a directory."""
 
     def __init__(self, release: Release, root: Path) -> None:
         self.release = release
         words = ["mmdebstrap", "--quiet", "--variant=extract", "--mode=chrootless"]
         words += ["--architectures=amd64", f"--include=python{release.python}"]
         # mmdebstrap must not depend on apt's settings of this computer.
-        _run(*words, release.suite, str(root), "http://deb.debian.org/debian")
+        _run(*words, release.suite, str(root), release.source)
         self._root = root
 
     def run(self, *words: str, path: Sequence[Path] = ()) -> str:
@@ -186,7 +196,7 @@ class Contents:
         """Write the package into the directory `out`. `made` is what `made_by_acsard` returned."""
         release = self._python.release
         upstream = self._version.replace(".dev", "~dev").replace("rc", "~rc")
-        revision = f"1~deb{release.number}"
+        revision = f"1~{release.name}"
         share = self._root / "usr/share"
         for name, place in SHELL_FILES.items():
             _copy(made / name, share / place)
@@ -247,7 +257,7 @@ def _downloaded(python: str, machine: str, where: Path) -> dict[str, Path]:
     # All that the lock names, by name. pip checks the hashes.
     words = [sys.executable, "-m", "pip", "download", "--quiet", "--no-deps", "--require-hashes"]
     words += ["--only-binary", ":all:", "--implementation", "cp", "--python-version", python]
-    # Debian 12 has glibc 2.36, which runs wheels for 2.36 and for all earlier versions.
+    # Debian 12 has the oldest glibc, 2.36, which runs wheels for 2.36 and for all earlier versions.
     for minor in range(36, 16, -1):
         words += ["--platform", f"manylinux_2_{minor}_{MACHINES[machine]}"]
     words += ["--platform", f"manylinux2014_{MACHINES[machine]}"]

@@ -1,4 +1,4 @@
-"""Make the Debian packages and bare roots of Debian, in which tests install them.
+"""Make the packages and bare roots of Debian and Ubuntu, in which tests install them.
 
 $ACSARD_TEST_DEBS names a directory for both. What it already has is used again. The roots of arm64
 run under qemu-user-static, so their speed means nothing.
@@ -22,8 +22,13 @@ from tests.system.harness import ROOT
 
 RELEASE = ROOT / "deploy" / "release"
 
-SUITES = {"12": "bookworm", "13": "trixie"}
-PYTHONS = {"12": "3.11", "13": "3.13"}
+SYSTEMS = {"deb12": "bookworm", "deb13": "trixie", "ubuntu24.04": "noble"}
+PYTHONS = {"deb12": "3.11", "deb13": "3.13", "ubuntu24.04": "3.12"}
+
+UBUNTU = (
+    "deb [signed-by=/usr/share/keyrings/ubuntu-archive-keyring.gpg] "
+    "http://archive.ubuntu.com/ubuntu noble main universe"
+)
 
 NUMBER, NEWER = "0.2.0.dev1", "0.2.0.dev2"
 """The version of the packages, and that of copies which only have another version."""
@@ -37,6 +42,8 @@ def missing_programs() -> str:
         return "not root"
     wanted = ("mmdebstrap", "ip", "x86_64-linux-gnu-strip", "aarch64-linux-gnu-strip")
     names = [name for name in wanted if shutil.which(name) is None]
+    if not Path("/usr/share/keyrings/ubuntu-archive-keyring.gpg").exists():
+        names.append("ubuntu-keyring (a package of Debian 13)")
     return f"no {', '.join(names)}" if names else ""
 
 
@@ -53,7 +60,7 @@ def runs_arm64() -> bool:
 
 
 def packages(out: Path, tools: Path) -> list[Path]:
-    """Return the four packages of this clone in the directory `out`, with the version `NUMBER`.
+    """Return the six packages of this clone in the directory `out`, with the version `NUMBER`.
 
     If it does not exist, make them with a venv of the locked tools, in the directory `tools`.
     """
@@ -88,9 +95,9 @@ def _wheel(python: str, work: Path) -> Path:
     return next(work.glob("*.whl"))
 
 
-def package(made: Iterable[Path], debian: str, machine: str) -> Path:
-    """Return the package for a Debian release and an architecture."""
-    return next(path for path in made if path.name.endswith(f"deb{debian}_{machine}.deb"))
+def package(made: Iterable[Path], system: str, machine: str) -> Path:
+    """Return the package for a system and an architecture."""
+    return next(path for path in made if path.name.endswith(f"~{system}_{machine}.deb"))
 
 
 def newer(package: Path, out: Path) -> Path:
@@ -123,9 +130,9 @@ def debian_version(number: str) -> str:
     return number.replace(".dev", "~dev")
 
 
-def packages_of_tests(where: Path, debian: str) -> Path:
+def packages_of_tests(where: Path, system: str) -> Path:
     """Return a directory with what the tests import besides acsard, without numpy."""
-    place = where / f"test-packages-{debian}"
+    place = where / f"test-packages-{system}"
     if not place.exists():
         project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
         extras = project["optional-dependencies"]
@@ -133,19 +140,19 @@ def packages_of_tests(where: Path, debian: str) -> Path:
         unneeded = ("acsard", "argparse-manpage")
         wanted = [name for name in extras["test"] if not name.startswith(unneeded)]
         words = [sys.executable, "-m", "pip", "install", "--quiet", "--target", str(place)]
-        words += ["--only-binary", ":all:", "--python-version", PYTHONS[debian]]
+        words += ["--only-binary", ":all:", "--python-version", PYTHONS[system]]
         _run(*words, *wanted, *extras["foxglove"])
-        # The tests run on Debian's numpy.
+        # The tests run on the system's numpy.
         for name in place.glob("numpy*"):
             shutil.rmtree(name)
     return place
 
 
 class Root:
-    """A minimal Debian without Python, in a directory, with /proc and /dev of this machine."""
+    """A minimal system without Python, in a directory, with this machine's /proc, /sys and /dev."""
 
-    def __init__(self, path: Path, debian: str) -> None:
-        self.path, self.debian = path, debian
+    def __init__(self, path: Path, system: str) -> None:
+        self.path, self.system = path, system
 
     def words(self, *words: str) -> list[str]:
         """Return the words of a host command that runs `words` inside."""
@@ -153,7 +160,8 @@ class Root:
         variables += ["DEBIAN_FRONTEND=noninteractive"]
         # The mounts end with the program, because they are in a mount namespace of its own.
         enter = (
-            'mount -t proc proc "$0/proc" && mount --rbind /dev "$0/dev" && exec chroot "$0" "$@"'
+            'mount -t proc proc "$0/proc" && mount --rbind /sys "$0/sys" && '
+            'mount --rbind /dev "$0/dev" && exec chroot "$0" "$@"'
         )
         words = ("env", "-i", *variables, *words)
         return ["unshare", "--mount", "sh", "-c", enter, str(self.path), *words]
@@ -186,20 +194,22 @@ class Root:
 
 
 @contextmanager
-def root(where: Path, debian: str, machine: str) -> Iterator[Root]:
-    """Provide a newly made minimal Debian with apt's lists, and remove it afterwards."""
-    suite = SUITES[debian]
+def root(where: Path, system: str, machine: str) -> Iterator[Root]:
+    """Provide a newly made minimal root with apt's lists, and remove it afterwards."""
+    suite = SYSTEMS[system]
     base = where / f"{suite}-{machine}.tar"
     if not base.exists():
         words = ["mmdebstrap", "--quiet", "--variant=minbase", f"--architectures={machine}"]
         # mmdebstrap removes apt's lists, which are not part of an installation by a person.
-        words += ["--skip=cleanup/apt", suite, str(base), "http://deb.debian.org/debian"]
+        source = UBUNTU if suite == "noble" else "http://deb.debian.org/debian"
+        # Ubuntu's minbase has no apt.
+        words += ["--skip=cleanup/apt", "--include=apt", suite, str(base), source]
         _run(*words)
     with tempfile.TemporaryDirectory(dir=where) as place:
         _run("tar", "-xf", str(base), "-C", place)
         os.chmod(place, 0o755)
         shutil.copyfile("/etc/resolv.conf", Path(place, "etc/resolv.conf"))
-        yield Root(Path(place), debian)
+        yield Root(Path(place), system)
 
 
 def _run(*words: str) -> None:

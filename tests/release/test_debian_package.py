@@ -1,4 +1,4 @@
-"""The Debian packages install, drive, upgrade and go in bare roots of Debian."""
+"""The packages install, drive, upgrade and go in bare roots of Debian and Ubuntu."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ import pytest
 from tests.release.debian_root import (
     NEWER,
     NUMBER,
-    SUITES,
+    SYSTEMS,
     Root,
     debian_version,
     missing_programs,
@@ -61,32 +61,34 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="session")
 def made(place: Path) -> list[Path]:
-    """Provide the four packages."""
+    """Provide the six packages."""
     return packages(place / "packages", place / "tools")
 
 
 @pytest.fixture
 def bare(request: pytest.FixtureRequest, place: Path, made: list[Path]) -> Iterator[Root]:
-    """Provide a new root of the Debian release and the architecture that the test names.
+    """Provide a new root of the system and the architecture that the test names.
 
     It has the package of this version, and that of a newer one.
     """
-    debian, machine = request.param
+    system, machine = request.param
+    if (system, machine) == ("ubuntu24.04", "arm64"):
+        pytest.skip("Ubuntu has its arm64 packages on another server")
     if machine == "arm64" and not runs_arm64():
         pytest.skip("needs qemu-user-static")
-    with root(place, debian, machine) as bare:
-        deb = package(made, debian, machine)
+    with root(place, system, machine) as bare:
+        deb = package(made, system, machine)
         shutil.copyfile(deb, bare.path / deb.name)
         newer(deb, bare.path)
         yield bare
 
 
 on_each = pytest.mark.parametrize(
-    "bare", [(debian, machine) for debian in SUITES for machine in MACHINES],
+    "bare", [(system, machine) for system in SYSTEMS for machine in MACHINES],
     indirect=True, ids="-".join,
 )  # fmt: skip
 on_amd64 = pytest.mark.parametrize(
-    "bare", [(debian, "amd64") for debian in SUITES], indirect=True, ids="-".join
+    "bare", [(system, "amd64") for system in SYSTEMS], indirect=True, ids="-".join
 )
 
 
@@ -110,7 +112,7 @@ def deb(number: str) -> str:
 
 @on_each
 @pytest.mark.skipif(CHROMIUM is None, reason="needs chromium-headless-shell")
-def test_two_commands_lead_from_a_bare_debian_to_driving_in_a_browser(bare: Root) -> None:
+def test_two_commands_lead_from_a_bare_system_to_driving_in_a_browser(bare: Root) -> None:
     host = f"acsard{os.getpid()}d"
     ip("netns", "add", host)
     try:
@@ -162,7 +164,7 @@ def test_it_takes_60_mb_and_every_module_imports(bare: Root) -> None:
 @on_amd64
 def test_the_unit_tests_pass_on_the_installed_files(bare: Root, place: Path) -> None:
     bare.run(f"apt-get install --yes {deb(NUMBER)} git")
-    packages = packages_of_tests(place, bare.debian)
+    packages = packages_of_tests(place, bare.system)
     shutil.copytree(packages, bare.path / "packages")
     for name in ("tests", "deploy", "README.md", "pyproject.toml", "acsard.toml"):
         copy = shutil.copytree if (ROOT / name).is_dir() else shutil.copyfile
@@ -229,7 +231,7 @@ MANUAL = ("python3", "-c", "import urllib.request as url; "
 def _two_packages(bare: Root, made: list[Path]) -> tuple[Path, Path]:
     """Give a root systemd and two packages of different versions, the older first."""
     bare.run("apt-get install --yes --no-install-recommends systemd-sysv dbus udev python3")
-    first = package(made, "12", "amd64")
+    first = package(made, "deb12", "amd64")
     shutil.copyfile(first, bare.path / first.name)
     return first, newer(first, bare.path)
 
@@ -237,7 +239,7 @@ def _two_packages(bare: Root, made: list[Path]) -> tuple[Path, Path]:
 def test_the_first_installation_starts_the_service_and_no_upgrade_restarts_it(
     made: list[Path], place: Path, tmp_path: Path
 ) -> None:
-    with root(place, "12", "amd64") as bare:
+    with root(place, "deb12", "amd64") as bare:
         first, second = _two_packages(bare, made)
         with Container(bare.path, tmp_path, "acsard-deb") as container:
             done = container.run("dpkg", "--install", f"/{first.name}")
@@ -282,7 +284,7 @@ def test_the_first_installation_starts_the_service_and_no_upgrade_restarts_it(
 def test_service_upgrade_changes_to_a_package_and_rollback_back_with_the_stop_latched(
     made: list[Path], place: Path, tmp_path: Path
 ) -> None:
-    with root(place, "12", "amd64") as bare:
+    with root(place, "deb12", "amd64") as bare:
         first, second = _two_packages(bare, made)
         with Container(bare.path, tmp_path, "acsard-deb") as container, Board(container) as board:
             done = container.run("dpkg", "--install", f"/{first.name}")

@@ -153,6 +153,16 @@ def test_a_time_measured_too_coarsely_to_judge_does_not_pass(
 # Lines.
 
 
+@FOUR_AND_TWO
+def test_a_last_motor_that_runs_on_for_want_of_a_comma_is_stopped_with_one(config: Config) -> None:
+    with Robot("comma_latched", config=config).board(rest=False) as board:
+        tokens = "".join(f"{letter}p00.00," for letter in board.letters)
+        board.wire.send(tokens.removesuffix("0.00,").encode() + b"2.00,\r\n")
+        board.listen(0.2)
+        board.stop_motors()
+        assert (board.comma, board.latched) == (True, True)
+
+
 @each("wheels", [WheelMap(), WheelMap("+x", "+w", "+v", "+z"), WheelMap(left="+x", right="+y")])
 @each("comma", [False, True])
 def test_each_damaged_line_turns_motors_and_is_invalid_as_its_name_says(

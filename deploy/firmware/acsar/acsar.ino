@@ -4,19 +4,19 @@
 // The pins of motors a to d. Channel A of an encoder needs a pin with an interrupt.
 #if defined(__AVR_ATmega2560__)  // Mega
 const byte MOTORS = 4;           // 2: only a and b are there
-const byte PWM[] = {5, 6, 7, 8}, FORWARD[] = {22, 24, 26, 28}, REVERSE[] = {23, 25, 27, 29};
+const byte PWM_PIN[] = {5, 6, 7, 8}, FORWARD[] = {22, 24, 26, 28}, REVERSE[] = {23, 25, 27, 29};
 const byte ENCODER_A[] = {2, 3, 18, 19}, ENCODER_B[] = {A9, A11, A13, A15};
-#elif defined(ESP32)  // 3.3 V
+#elif defined(ESP32)  // 3.3 V; an S2, S3 or C3 needs other pins
 const byte MOTORS = 2;
-const byte PWM[] = {25, 33}, FORWARD[] = {26, 32}, REVERSE[] = {27, 13};
+const byte PWM_PIN[] = {25, 33}, FORWARD[] = {26, 32}, REVERSE[] = {27, 13};
 const byte ENCODER_A[] = {18, 22}, ENCODER_B[] = {19, 23};
 #elif defined(ARDUINO_ARCH_RP2040)  // Pico, 3.3 V
 const byte MOTORS = 2;              // or 4
-const byte PWM[] = {2, 3, 4, 5}, FORWARD[] = {6, 8, 10, 12}, REVERSE[] = {7, 9, 11, 13};
+const byte PWM_PIN[] = {2, 3, 4, 5}, FORWARD[] = {6, 8, 10, 12}, REVERSE[] = {7, 9, 11, 13};
 const byte ENCODER_A[] = {14, 16, 18, 20}, ENCODER_B[] = {15, 17, 19, 21};
 #else  // Uno, Nano, and others that have these pins
 const byte MOTORS = 2;
-const byte PWM[] = {9, 11}, FORWARD[] = {12, 7}, REVERSE[] = {13, 8};
+const byte PWM_PIN[] = {9, 11}, FORWARD[] = {12, 7}, REVERSE[] = {13, 8};
 const byte ENCODER_A[] = {3, 2}, ENCODER_B[] = {5, 4};
 #endif
 
@@ -88,10 +88,10 @@ void control() {  // a command of zero is no voltage: so not even a reversed enc
     integral[i] = wanted[i] ? constrain(integral[i] + KI * TICK_MS / 1000 * error, -1.0f, 1.0f) : 0;
     int pwm = wanted[i] ? constrain(255 * (wanted[i] / FREE_SPEED + KP * error + integral[i]), -255.0f, 255.0f) : 0;
     int8_t way = (pwm > 0) - (pwm < 0);
-    if (way != before[i]) analogWrite(PWM[i], 0);  // the direction changes without voltage
+    if (way != before[i]) analogWrite(PWM_PIN[i], 0);  // the direction changes without voltage
     digitalWrite(FORWARD[i], way > 0);
     digitalWrite(REVERSE[i], way < 0);
-    analogWrite(PWM[i], abs(pwm));
+    analogWrite(PWM_PIN[i], abs(pwm));
     before[i] = way;
   }
 }
@@ -166,7 +166,7 @@ void setup() {
   guard();
   if (ESTOP >= 0) pinMode(ESTOP, INPUT_PULLUP);
   for (byte i = 0; i < MOTORS; i++) {
-    pinMode(PWM[i], OUTPUT), pinMode(FORWARD[i], OUTPUT), pinMode(REVERSE[i], OUTPUT);
+    pinMode(PWM_PIN[i], OUTPUT), pinMode(FORWARD[i], OUTPUT), pinMode(REVERSE[i], OUTPUT);
     pinMode(ENCODER_A[i], INPUT_PULLUP), pinMode(ENCODER_B[i], INPUT_PULLUP);
     levels[i] = digitalRead(ENCODER_A[i]);
     attachInterrupt(digitalPinToInterrupt(ENCODER_A[i]), edges[i], CHANGE);
