@@ -141,7 +141,8 @@ def packages_of_tests(where: Path, system: str) -> Path:
         wanted = [name for name in extras["test"] if not name.startswith(unneeded)]
         words = [sys.executable, "-m", "pip", "install", "--quiet", "--target", str(place)]
         words += ["--only-binary", ":all:", "--python-version", PYTHONS[system]]
-        _run(*words, *wanted, *extras["foxglove"])
+        # The package leaves these out, but a copy of an environment has them.
+        _run(*words, *wanted, *extras["foxglove"], "markdown-it-py", "pygments")
         # The tests run on the system's numpy.
         for name in place.glob("numpy*"):
             shutil.rmtree(name)

@@ -12,6 +12,7 @@ import signal
 import subprocess
 import time
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import NamedTuple
 
@@ -131,10 +132,9 @@ class Robot(NamedTuple):
         return [one.line for one in self.board.since(since) if one.line not in (ZERO, b"-")]
 
 
-@pytest.fixture(scope="module")
-def installed(rootfs: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Container]:
+@contextmanager
+def installing(rootfs: Path, scratch: Path) -> Iterator[Container]:
     """Provide a systemd in which `acsard service install` has installed the service."""
-    scratch = tmp_path_factory.mktemp("upgrade")
     with Container(rootfs, scratch, "acsard-upgrade") as container:
         container.install()
         container.run("rm", "-rf", VERSIONS)
@@ -146,10 +146,9 @@ def installed(rootfs: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterato
         yield container
 
 
-@pytest.fixture
-def robot(installed: Container) -> Iterator[Robot]:
+@contextmanager
+def started(container: Container) -> Iterator[Robot]:
     """Provide a robot with the installed version, a link, and nothing else in /opt/acsard."""
-    container = installed
     old = container.run(ACSARD, "--version").out.split()[1]
     container.run("systemctl", "stop", UNIT)
     container.types(
@@ -163,6 +162,18 @@ def robot(installed: Container) -> Iterator[Robot]:
         until(robot.link, 10.0, "the link is up")
         yield robot
     container.path(PORT).unlink(missing_ok=True)
+
+
+@pytest.fixture(scope="module")
+def installed(rootfs: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Container]:
+    with installing(rootfs, tmp_path_factory.mktemp("upgrade")) as container:
+        yield container
+
+
+@pytest.fixture
+def robot(installed: Container) -> Iterator[Robot]:
+    with started(installed) as robot:
+        yield robot
 
 
 def test_an_upgrade_runs_the_new_version_and_a_rollback_the_old_one_with_the_stop_latched(
