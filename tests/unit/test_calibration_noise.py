@@ -262,7 +262,9 @@ def test_the_noise_of_a_good_robot_is_found_and_then_stays() -> None:
     assert not again.distance_better
 
 
-@pytest.mark.parametrize("way", ["gyro", "places", "headings"])
+@pytest.mark.parametrize(
+    "way", ["gyro", pytest.param("places", marks=pytest.mark.slow), "headings"]
+)
 def test_a_sensor_that_is_late_shows_no_more_noise(way: str) -> None:
     found = []
     for late_s in (0.0, 0.4):
