@@ -54,6 +54,12 @@ LEAST_S, LEAST_PART_S = 30.0, 2.0  # of a log of which a part is left out, and o
 STILL, ALONE = 1e-3, 0.2  # of a side that stands, rad in a step, and what the other rolls meanwhile
 TWICE, BACKWARDS = 0.02, 1e-3  # share of the rolled angle; rad in a row
 
+# A gyro has two levels beside the wheels if this share of its rows is near one of them, this share
+# near the rarer one, and they are apart by so many of their spreads and this share of the larger.
+# Sound logs: 0.57, 3 spreads, 3 changes. Two IMUs by turns: 1.0, 20 spreads, 6 changes and more.
+NEAR, RARER, SPREADS, LEVELS_APART, CHANGES = 0.7, 0.1, 8.0, 0.2, 6
+FAST, STEADY = 0.3, 0.05  # share of the fast turns, which is compared; of a turn that is kept
+
 NAMES = {"gyro": "yaw_rate", "headings": "yaw", "positions": "x, y"}
 COLUMNS = {
     "gyro": ("gyro_t", "turned"), "headings": ("yaw_t", "yaw"), "positions": ("place_t", "place"),
@@ -134,7 +140,11 @@ def examined(
     """Return the runs without the parts and sensors that contradict all others, the match of each
     sensor that is left, and notes. Raise `LogError` with the cause that explains a contradiction.
     """
-    base = Base.of(drive)
+    base, notes = Base.of(drive), list[str]()
+    if fact := _alternates(runs, base):
+        if sensors(runs) == ["gyro"]:
+            raise LogError(f"{fact}. Record only one of them")
+        runs, notes = [without(run, "gyro") for run in runs], [f"yaw_rate is left out: {fact}"]
     matches = {sensor: matched(sensor, runs, base) for sensor in sensors(runs)}
     odd = {s: m for s, m in matches.items() if not (m.given and m.follows) or m.bad}
     for cause in _facts(runs, odd) if odd else ():
@@ -151,7 +161,6 @@ def examined(
         *_late(following),
     ]:
         raise LogError(". ".join(causes))
-    notes = []
     for sensor, match in matches.items():
         name = NAMES[sensor]
         fact = f"{match.unexplained:.0%} of the motion by {name} is not that of the wheels"
@@ -195,6 +204,45 @@ def gyro_bias(runs: Sequence[Run]) -> tuple[float, float]:
     rest = np.concatenate(rates)
     known = len(rest) > MIN_RESTS
     return (float(np.median(rest)), REST_BIAS_STD) if known else (0.0, BIAS_STD)
+
+
+def _alternates(runs: Sequence[Run], base: Base) -> str:
+    # What a gyro that is now this, now that share of the wheels' turn shows: two sensors in blocks.
+    found = [(np.zeros(0), np.zeros(0))]
+    for run in runs:
+        t = (run.gyro_t[1:] + run.gyro_t[:-1]) / 2
+        left, right = (np.gradient(side, run.t) for side in (run.left, run.right))
+        turn = np.interp(t, run.t, base.right * right - base.left * left) / base.track
+        found.append((turn, np.diff(run.turned) / np.maximum(np.diff(run.gyro_t), 1e-9)))
+    turn, rate = (np.concatenate(columns) for columns in zip(*found, strict=True))
+    size = np.abs(turn)
+    usual = float(np.quantile(size, 0.9)) if len(size) else 0.0
+    fast = np.flatnonzero(size > max(1e-6, FAST * usual))
+    if len(fast) < MIN_RESTS:
+        return ""
+    share = rate[fast] / turn[fast]
+    low, high = np.quantile(share, [RARER, 1 - RARER])
+    for _ in range(ROUNDS):
+        upper = share > (low + high) / 2
+        if upper.all() or not upper.any():
+            return ""
+        low, high = np.median(share[~upper]), np.median(share[upper])
+    off, apart = np.abs(share - np.where(upper, high, low)), float(high - low)
+    spread = 1.48 * max(float(np.median(off[upper])), float(np.median(off[~upper])))
+    near = off < apart / 4
+    rows, upper = fast[near], upper[near]
+    kept = np.abs(np.diff(turn[rows])) < STEADY * size[rows[1:]]
+    changes = int(((np.diff(upper.astype(int)) != 0) & (np.diff(rows) < 4) & kept).sum())
+    if (
+        near.mean() < NEAR or min(upper.mean(), 1 - upper.mean()) < RARER or changes < CHANGES
+        or apart < max(SPREADS * spread, LEVELS_APART * max(abs(low), abs(high)))
+    ):  # fmt: skip
+        return ""
+    return (
+        f"yaw_rate is now {low:.2f}, now {high:.2f} times the turn rate of the wheels, and changes "
+        f"{changes} times while they keep theirs, as if two programs or sensors wrote it by turns "
+        "(two IMUs on one topic)"
+    )
 
 
 def _without_spans(runs: Sequence[Run], spans: Sequence[Span]) -> tuple[list[Run], list[str]]:

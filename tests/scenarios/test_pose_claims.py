@@ -126,7 +126,7 @@ def test_a_gyro_that_contradicts_the_wheels_is_a_doubt_and_is_said(
 
 
 @pytest.mark.variations(6)
-@pytest.mark.parametrize("share", [0.9, 1.07, 1.1])
+@pytest.mark.parametrize("share", [0.9, 0.97, 1.03, 1.07, 1.1])
 @pytest.mark.parametrize("std", ["uncalibrated", 0.02])
 @four_and_two
 def test_a_share_of_a_turn_by_which_gyro_and_wheels_may_differ_is_claimed(

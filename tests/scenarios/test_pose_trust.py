@@ -160,3 +160,29 @@ def test_without_encoders_the_whole_commanded_motion_is_a_doubt(
     before = world.odom.pose.covariance
     world.run(20.0)
     assert world.odom.pose.covariance == pytest.approx(before)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("link_check", ["off", "on"])
+def test_a_robot_that_was_unplugged_for_long_drives_on_and_its_pose_can_be_set(
+    link_check: Any,
+) -> None:
+    """Its doubt is bounded within 10 s: a night is no other than half an hour."""
+    world = World(Config(mcu=McuConfig("/dev/ttyACM0", link_check=link_check)))
+    world.run(1.5)
+    world.drive(0.3, 0.2, 2.0)
+    world.drive(0.0, 0.0, 1.0)
+    mcu = world.mcu
+    world.port.unplug()
+    world.run(1800.0)
+    world.port.plug(mcu)
+    world.run(2.0)
+    assert world.odom.pose.covariance[0] < 102.0
+    before = mcu.vehicle.pose
+    world.drive(0.3, 0.0, 2.0)
+    assert math.dist((before.x, before.y), (mcu.vehicle.pose.x, mcu.vehicle.pose.y)) > 0.4
+    assert world.state.mode == "driving"
+    world.drive(0.0, 0.0, 1.0)
+    assert world.call("set_pose", b'{"x": 1.0, "y": 2.0, "yaw": 0.0}').success
+    world.run(0.5)
+    assert world.odom.pose.covariance[0] < 1e-4

@@ -54,6 +54,34 @@ def right(data: bytes, truth: tuple[float, ...], note: str) -> None:
     assert any(re.search(note, text) for text in found.notes) == bool(note), found.notes
 
 
+# two IMUs on one topic
+
+OTHER_IMU: dict[str, Callable[[Columns], Columns]] = {
+    "other axis": times(0.02, "yaw_rate"), "upside down": times(-1.0, "yaw_rate"),
+    "half": times(0.5, "yaw_rate"), "twice": times(2.0, "yaw_rate"),
+}  # fmt: skip
+
+
+def in_blocks(kind: str, names: tuple[str, ...], block_s: float) -> bytes:
+    rows = sound(1, names)
+    other = OTHER_IMU[kind](rows)["yaw_rate"]
+    first = rows["t"] // block_s % 2 < 1
+    return csv(rows | {"yaw_rate": np.where(first, rows["yaw_rate"], other)})
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("block_s", [0.5, 1.0, 3.0, 10.0])
+@pytest.mark.parametrize("kind", OTHER_IMU)
+def test_two_imus_that_alternate_in_blocks_are_named(kind: str, block_s: float) -> None:
+    assert re.search(r"yaw_rate is now .* by turns", refusal(in_blocks(kind, GYRO, block_s)))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", OTHER_IMU)
+def test_two_imus_that_alternate_in_blocks_are_left_out_beside_positions(kind: str) -> None:
+    right(in_blocks(kind, (*GYRO, *PLACES), 1.0), BY_POSES, "yaw_rate is left out: .* by turns")
+
+
 # planted faults
 
 EVERY = [(way, fault) for way in SENSORS for fault in FAULTS if fault not in NOT_SHOWN[way]]
@@ -85,7 +113,10 @@ def test_planted_faults_are_never_written_and_named_in_80_percent(way: str, faul
 def test_sound_logs_are_accepted(way: str) -> None:
     truth = BY_GYRO if way == "gyro" else BY_POSES
     for seed in range(10):
-        right(csv(sound(seed, SENSORS[way])), truth, "")
+        found = result(csv(sound(seed, SENSORS[way])))
+        assert found.better
+        assert list(found.found.values()) == pytest.approx(truth, abs=0.01)
+        assert not any("is left out" in note for note in found.notes)
 
 
 # situations of real logs, and their siblings
