@@ -34,6 +34,10 @@ from tests.unit.kernel_files import HWMON, POLICY, QUIET, write
 INFO = Info("acsar", "1.2", 77, "/dev/pts/3", False, 100.0, [], [])
 FILE = Config()
 
+SETTINGS = (
+    "correct your file; `acsard check --new FILE` writes all settings with their explanations"
+)
+
 
 def running(config: Config = FILE, **more: float) -> Running:
     return Running(INFO, config, (), "", **more)  # type: ignore[arg-type]
@@ -56,7 +60,7 @@ def test_a_reason_of_two_reports_is_printed_once_where_it_is_not_ok() -> None:
 
 def test_each_remedy_is_said_once() -> None:
     text = b"[mcu]\nbaud_rate = 1\nreply_period = -1"
-    assert [finding.mend for finding in examine("x", text, {})] == ["see acsard.toml", ""]
+    assert [finding.mend for finding in examine("x", text, {})] == [SETTINGS, ""]
 
 
 def test_the_file_s_values_are_ok() -> None:

@@ -18,7 +18,7 @@ FILES = table(
     """
 FAIL configuration: wrong
     {where}: {problem}
-    -> see acsard.toml
+    -> correct your file; `acsard check --new FILE` writes all settings with their explanations
 OK configuration: read
     {where}
 OK configuration: secret
@@ -26,7 +26,7 @@ OK configuration: secret
     daemon's port and files were not examined
 WARN configuration: doubtful
     {warning}
-    -> see acsard.toml
+    -> correct your file; `acsard check --new FILE` writes all settings with their explanations
 OK configuration: other robot
     the file is not compared with the daemon: it is for robot {ours}, not for {runs}
 OK configuration: same

@@ -105,8 +105,8 @@ WARN refused
 WARN command_gaps
     commands of {source} came up to {seconds:.1f} s apart, but count for {timeout:g} s: the robot
     braked in between
-    -> let the program send at a steady rate, with a timer of its own; `acsard echo state` shows
-    longest_gap of each source
+    -> if the program pauses, let a timer of its own repeat the last command; if the network does,
+    run the program on the robot; `acsard echo state` shows longest_gap of each source
 WARN never_zero
     {source} sends {linear:.3f} m/s and {angular:.3f} rad/s, and no zero for over 3 s
     -> if nobody moves it, this is the offset of the stick: let its program send zeros below it (a
