@@ -82,7 +82,7 @@ class Watched:
         where = ["--id", ",".join(ROBOTS), "--connect", endpoint, "--tls", self.where / "operator"]
         seen = typed("fleet", "--json", *map(str, where))
         assert seen.code == 0, seen
-        (command,) = (line for block in self.blocks() for line in block if "| jq" in line)
+        (command,) = (line for block in self.blocks() for line in block if "> robots.json" in line)
         jq = command.partition("|")[2]
         subprocess.run(["sh", "-c", jq], cwd=self.where, input=seen.out, text=True, check=True)
         targets = (self.where / "robots.json").read_text()
