@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import random
 from contextlib import nullcontext
 from functools import partial
@@ -9,7 +10,7 @@ from functools import partial
 import pytest
 from msgspec.structs import replace
 
-from acsard.core.config.settings import Config, McuConfig, SimConfig, WheelMap
+from acsard.core.config.settings import Config, ControlConfig, McuConfig, SimConfig, WheelMap
 from acsard.core.values import NS_PER_S
 from tests.scenarios.pose_faults import judged
 from tests.scenarios.world import World
@@ -80,6 +81,39 @@ def test_time_passes_in_long_silences(unplug: bool, wheels: WheelMap) -> None:
             lose(world, 1.5, unplug=unplug)
             world.run(0.15)
             seen_s += 0.15
+    assert faults(world)[0] == "wheel_runaway"
+
+
+def slower_than_declared(wheels: WheelMap, period: float, each: float) -> World:
+    """Return a world whose board reports so rarely that each line ends a silence."""
+    mcu = McuConfig(wheels=wheels, encoder_counts=400, reply_period=period)
+    world = World(
+        Config(mcu=mcu, control=ControlConfig(rate=25.0), sim=SimConfig(encoder_counts=400))
+    )
+    world.mcu.fault("free_running", period).__enter__()
+    world.run(0.5)
+    world.mcu.fault("sparse_replies", each).__enter__()
+    return world
+
+
+@pytest.mark.parametrize("to_and_fro", [False, True])
+@pytest.mark.parametrize(("period", "each"), [(0.02, 0.1), (0.1, 0.2), (0.2, 0.4)])
+@four_and_two
+def test_lines_of_which_each_ends_a_silence_show_a_runaway(
+    period: float, each: float, to_and_fro: bool, wheels: WheelMap
+) -> None:
+    world = slower_than_declared(wheels, period, each)
+    for _ in range(5):
+        world.drive(0.5, seconds=2.0)
+        if to_and_fro:
+            world.drive(-0.5, 0.5, seconds=2.0)
+    assert not faults(world), world.state.reason
+    vehicle = world.mcu.vehicle
+    began = vehicle.pose.x, vehicle.pose.y
+    with world.mcu.fault("pushed", 0.5):
+        world.call("stop")
+        while not faults(world) and math.dist(began, (vehicle.pose.x, vehicle.pose.y)) < 2.0:
+            world.run(0.1)
     assert faults(world)[0] == "wheel_runaway"
 
 

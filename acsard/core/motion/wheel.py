@@ -54,10 +54,8 @@ class Wheel(Struct):
         play = self.play + angle
         self.play = min(max(play, 0.0), block.unit)
         self.sure += play - self.play
-        if moves and self.rested:
-            # A wheel rests with the robot: under way, a side that stands is commanded to.
-            self.obedience.forget()
-            self.rested, self.rest_s, self.rest_angle = False, 0.0, 0.0
+        if moves:
+            self.end_rest()
         if not -COMMANDED < command < COMMANDED:
             self.rest_s = self.rest_angle = 0.0
         elif not self.rested:
@@ -67,6 +65,12 @@ class Wheel(Struct):
             self.same_s += s
         else:
             self.same_s, self.reported = 0.0, speed
+
+    def end_rest(self) -> None:
+        """The robot moves by its commands: a side that stands meanwhile is commanded to."""
+        if self.rested:
+            self.obedience.forget()
+            self.rested, self.rest_s, self.rest_angle = False, 0.0, 0.0
 
     def rest(self, angle: Rad, block: Block) -> None:
         """Add a block without a command."""

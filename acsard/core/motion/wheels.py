@@ -269,6 +269,9 @@ class Wheels(Struct):
         pairs = zip(self.wheels, ends, strict=False)
         speeds = [_nearer(wheel.speed, speed) if short else 0.0 for wheel, speed in pairs]
         before = [(*side.told, *side.smooth) for side in self.sides]
+        if any(abs(speed) >= COMMANDED for side in self.sides for speed in side.told):
+            for wheel in self.wheels:
+                wheel.end_rest()
         if not short:
             # Smoothing begins again.
             for side in self.sides:
@@ -279,11 +282,14 @@ class Wheels(Struct):
         for _ in range(_steps(s, step_s)):
             self._begin_step()
             self._follow_commands(self.commanded, step_s, lag)
-            for wheel, speed in zip(self.wheels, speeds, strict=True):
+            for i, (wheel, speed) in enumerate(zip(self.wheels, speeds, strict=True)):
+                wheel.command = self.sides[SIDE_OF[i]].command
                 wheel.turned = wheel.sure = speed * step_s
             self.step_s = step_s
             self._obey(block.unit, before, unknown)
-        for wheel in self.wheels:
+        for wheel, speed in zip(self.wheels, ends, strict=False):
+            if not block.s:
+                wheel.speed = wheel.sure_speed = speed  # each line ends a silence
             wheel.play = 0.0 if wheel.speed > 0.0 else block.unit  # the next count may be of then
         self._begin_step()
 
