@@ -24,7 +24,7 @@ from acsard.core.link.link_setup import LinkSetup
 from acsard.core.link.link_state import WATCHDOG_S
 from acsard.core.motion.arbiter_text import missed, refused, waiting
 from acsard.core.motion.battery import empty_reason
-from acsard.core.motion.emergency_stop import DRIVER_FAULT_REASON
+from acsard.core.motion.emergency_stop import DRIVER_FAULT_REASON, PRESSED_REASON
 from acsard.core.motion.kinematics import Kinematics
 from acsard.core.motion.limits import coast, follow
 from acsard.core.motion.modes import Mode, RefusedError
@@ -430,10 +430,10 @@ class Robot:
         state = self.state
         checks = state.checks
         wheels = checks.wheels
-        # While the emergency stop counts as pressed, the motors may have no power, so wheels that
-        # do not follow the commanded speeds are not a sign of a fault.
+        # While the emergency stop is pressed, the motors may have no power, so wheels that do not
+        # follow the commanded speeds are not a sign of a fault. Its silence tells nothing of them.
         estop = state.inputs.estop
-        pressed = estop.is_pressed or estop.pressed_now is not None
+        pressed = estop.state == "pressed" or estop.pressed_now is PRESSED_REASON
         # Without a link the board hears nothing, and must stop the motors.
         speeds = state.out.speeds if state.session.link == "up" else STILL
         wheels.commanded = None if pressed else speeds

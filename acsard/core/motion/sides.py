@@ -59,7 +59,9 @@ class Side(Struct):
     expected: RadPerS = 0.0  # behind the whole response time
     halfway: RadPerS = 0.0  # behind half of it
     due: Expected = field(default_factory=Expected)
-    told: tuple[RadPerS, RadPerS] = (0.0, 0.0)  # least and largest command since the last block
+    # The least and the largest command since the last line, and in the silence before the block.
+    told: tuple[RadPerS, RadPerS] = (0.0, 0.0)
+    told_in_silence: tuple[RadPerS, RadPerS] = (0.0, 0.0)
     angle: Rad = 0.0  # commanded since the last step, and the same behind the lags
     half_angle: Rad = 0.0
     whole_angle: Rad = 0.0
@@ -85,11 +87,14 @@ class Side(Struct):
     def wheels(self) -> tuple[int, ...]:
         return (self.front,) if self.front == self.rear else (self.front, self.rear)
 
+    def tell(self, command: RadPerS) -> None:
+        """Take a command that the wheels may follow."""
+        self.told = min(command, self.told[0]), max(command, self.told[1])
+
     def expect(self, command: RadPerS, s: Seconds, lag: Seconds) -> None:
         """Add what a wheel that follows the command behind a lag rolls in a block."""
         # Exact for a command that is constant in the block; the mean of two is, in a ramp.
         goal, self.command = (self.command + command) / 2, command
-        self.told = command, command
         self.angle += goal * s
         self.expected, angle = lagged(self.expected, goal, s, lag)
         self.whole_angle += angle

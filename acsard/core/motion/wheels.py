@@ -84,6 +84,7 @@ class Wheels(Struct):
     sides: tuple[Side, Side]
     # Commanded speeds; the caller sets these three. None: the emergency stop may cut the power.
     commanded: WheelSpeeds | None = STILL
+    heeded: WheelSpeeds | None = STILL  # the same at the last line
     # For which the last line does not tell what the wheels did: lines or commands are missing.
     unseen: Seconds = 0.0
     # The silence before the block, and how far and for how long its last line says they turned.
@@ -128,11 +129,17 @@ class Wheels(Struct):
         self.gives_up = False
         if self.unseen:
             # The lines before a silence are a block, and so are those behind it.
+            commanded, self.commanded = self.commanded, self.heeded
             self._end_block(feedback, kinematics, count)
+            self.commanded = commanded
+            for side in self.sides:
+                side.told_in_silence = side.told
+            self._heed()
             self.silent_s, self.speeds = self.unseen, speeds
             self.covered, self.covered_s = times(speeds.as_tuple(), dt), dt
             return
         self.line, self.speeds = turned, speeds
+        self._heed()
         front_right, front_left, rear_left, rear_right = self.angles
         first, second, third, fourth = turned
         front_right += first
@@ -157,7 +164,12 @@ class Wheels(Struct):
     def tell(self, commanded: WheelSpeeds) -> None:
         """Take a command that is written, with or without lines: the wheels may follow it."""
         for side, speed in zip(self.sides, _of_sides(commanded), strict=True):
-            side.told = min(side.told[0], speed), max(side.told[1], speed)
+            side.tell(speed)
+
+    def _heed(self) -> None:
+        self.heeded = commanded = self.commanded
+        for side, speed in zip(self.sides, _of_sides(commanded or STILL), strict=True):
+            side.told = speed, speed
 
     def forget(self) -> None:
         """Drop the evidence of faults: one was cleared."""
@@ -268,8 +280,8 @@ class Wheels(Struct):
             self._obey(block.unit)
         pairs = zip(self.wheels, ends, strict=False)
         speeds = [_nearer(wheel.speed, speed) if short else 0.0 for wheel, speed in pairs]
-        before = [(*side.told, *side.smooth) for side in self.sides]
-        if any(abs(speed) >= COMMANDED for side in self.sides for speed in side.told):
+        before = [(*side.told_in_silence, *side.smooth) for side in self.sides]
+        if any(abs(speed) >= COMMANDED for side in self.sides for speed in side.told_in_silence):
             for wheel in self.wheels:
                 wheel.end_rest()
         if not short:
@@ -290,7 +302,6 @@ class Wheels(Struct):
         for wheel, speed in zip(self.wheels, ends, strict=False):
             if not block.s:
                 wheel.speed = wheel.sure_speed = speed  # each line ends a silence
-            wheel.play = 0.0 if wheel.speed > 0.0 else block.unit  # the next count may be of then
         self._begin_step()
 
     def _begin_at(self, block: Block) -> None:
