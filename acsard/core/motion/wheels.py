@@ -300,8 +300,10 @@ class Wheels(Struct):
             self.step_s = step_s
             self._obey(block.unit, before, unknown)
         for wheel, speed in zip(self.wheels, ends, strict=False):
-            if not block.s:
-                wheel.speed = wheel.sure_speed = speed  # each line ends a silence
+            if not block.s and self.covered_s >= BLOCK_S:
+                # Each line ends a silence.
+                share = self.covered_s / (self.covered_s + _smoothed_s(abs(speed), block.unit))
+                wheel.speed = wheel.sure_speed = wheel.speed + share * (speed - wheel.speed)
         self._begin_step()
 
     def _begin_at(self, block: Block) -> None:
@@ -338,10 +340,7 @@ class Wheels(Struct):
         s, fastest, least = self.step_s, 0.0, max(FAULT_ANGLE, FAULT_COUNTS * count)
         for side, speeds in zip(self.sides, before, strict=True):
             size = max(abs(side.angle) / s, *[abs(self.wheels[i].speed) for i in side.wheels])
-            smoothed = SMOOTHED_S
-            if size * SMOOTHED_S > SMOOTHED_COUNTS * count:
-                smoothed = SMOOTHED_COUNTS * count / size
-            share = 1.0 / (smoothed + s)
+            share = 1.0 / (_smoothed_s(size, count) + s)
             if side in unknown:
                 side.remember(s, 0.0, *speeds)
                 continue
@@ -491,6 +490,11 @@ def new_wheels(independent: int) -> Wheels:
 def count_angle(counts: int) -> Rad:
     """Return the angle of an encoder count; `counts` per turn are 0 if they are unknown."""
     return math.tau / (counts or ASSUMED_COUNTS)
+
+
+def _smoothed_s(size: RadPerS, count: Rad) -> Seconds:
+    enough = SMOOTHED_COUNTS * count
+    return enough / size if size * SMOOTHED_S > enough else SMOOTHED_S
 
 
 def _steps(s: Seconds, step_s: Seconds) -> int:
