@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import re
 
+import pytest
+
 from tests.pages import text_of
-from tests.tools.interface import PUBLIC, names, names_of, released
+from tests.tools.interface import PUBLIC, RELEASED, names, names_of, released
 
 
 def unannounced(before: set[str], now: set[str], changelog: str) -> set[str]:
@@ -16,8 +18,8 @@ def unannounced(before: set[str], now: set[str], changelog: str) -> set[str]:
     return {name for name in before - now if not words & {name.rpartition("/")[2], name}}
 
 
+@pytest.mark.skipif(not RELEASED.exists(), reason="nothing was released: each name may still go")
 def test_a_public_name_goes_only_if_the_changelog_says_what_to_write_instead() -> None:
-    """A name that was never released may go: `python -m tests.tools.interface` writes the list."""
     assert unannounced(released(), names(), text_of("CHANGELOG.md")) == set()
 
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 import json
 import re
 import runpy
+import shutil
 import subprocess
 import sys
 import xml.etree.ElementTree as ET
@@ -164,6 +165,36 @@ def bridge_setting(path: str) -> Any:
 
 def published_names(direction: str) -> set[str]:
     return {f"/{row.name}" for row in ros_names() if row.direction == direction}
+
+
+# describe.py
+
+
+@pytest.mark.parametrize(
+    ("file", "text", "missing"),
+    [
+        ("acsar.urdf", 'velocity="40.0"', "velocity="),
+        ("acsar.urdf", 'radius="0.05"', "radius="),
+        ("acsar.urdf", '"lidar_link"', "lidar_link"),
+        ("acsar.urdf", '"base_link"', "base_link"),
+        ("acsar.urdf", "front_left_wheel_joint", "front_left_wheel_joint"),
+        ("acsar.urdf", "<!--\n  The robot", "<!--"),
+        ("nav2_params.yaml", "global_frame: odom", "global_frame"),
+        ("nav2_params.yaml", "base_footprint", "base_footprint"),
+        ("ekf.yaml", "world_frame:", "world_frame"),
+    ],
+)
+def test_a_value_that_finds_no_place_in_a_file_ends_describe_py(
+    file: str, text: str, missing: str, tmp_path: Path
+) -> None:
+    shutil.copytree(FILES, tmp_path, dirs_exist_ok=True)
+    (tmp_path / "robot.json").write_bytes(msgspec.json.encode(effective(CONFIG)))
+    (tmp_path / file).write_text((tmp_path / file).read_text().replace(text, "other"))
+    words = [sys.executable, "describe.py", "robot.json", "my_robot"]
+    done = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True, timeout=20)
+    assert done.returncode == 1
+    assert re.search(f"no text that fits .*{missing}.*take all files", done.stderr)
+    assert not (tmp_path / "my_robot").exists()
 
 
 # acsar.urdf

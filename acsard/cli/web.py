@@ -87,8 +87,9 @@ def _add_token(parser: argparse.ArgumentParser) -> None:
         "--token",
         type=Path,
         metavar="FILE",
-        help="let in a program that has this token, so that one program reads many robots; the "
-        "file has what `openssl rand -hex 32` prints (default: a new token, in a link)",
+        help="with the role viewer: let in a program that has this token, so that one program "
+        "reads many robots; the file has what `openssl rand -hex 32` prints (default: a new token, "
+        "in a link)",
     )
     lasting = parser.add_mutually_exclusive_group()
     lasting.add_argument(

@@ -332,7 +332,7 @@ class SourceStatus(Struct, frozen=True):
     age_s: float | None
     waits_for: Wait
     twist: Twist | None = None
-    longest_gap_s: Seconds = 0.0  # between a speed and the next command, in the last minute
+    longest_gap_s: Seconds = 0.0  # from a speed to the next accepted command, in the last minute
 
 
 class WheelsStatus(Struct, frozen=True):

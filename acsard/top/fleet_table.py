@@ -79,11 +79,11 @@ def row_cells(row: Row, newest: tuple[int, ...]) -> tuple[str, ...]:
 
 
 def _expired(row: Row) -> str:
-    # TLS then closes every link to the robot, which drives no more.
+    # The last `state` says when, whatever the robot does now: it may be switched off as well.
     days = row.state.certificate_days if row.state else None
     if days is None or row.age < days * DAY_S:
         return ""
-    return " (certificate_expired: type `acsard doctor` on the robot)"
+    return " (its certificate has ended by now: type `acsard doctor` on the robot)"
 
 
 def _version(state: RobotState, newest: tuple[int, ...]) -> str:

@@ -220,7 +220,7 @@ def _waits(source: SourceState, state: RobotState) -> str:
     elif source.wait == "neutral" and source.linear is not None and source.angular is not None:
         parts.append(f"it sends {source.linear:.3f} m/s, {source.angular:.3f} rad/s")
     if source.longest_gap > SHOWN_GAP_S:
-        parts.append(f"commands up to {source.longest_gap:.1f} s apart")
+        parts.append(f"usable commands up to {source.longest_gap:.1f} s apart")
     return "; ".join(parts)
 
 

@@ -37,7 +37,7 @@ SERVICE_DIRECTORY = Path("/var/lib/acsard-web")
 # Of the time in the token file: more writes would wear out an SD card.
 TIME_PERIOD_S = 60
 
-# As long as the 32 random bytes of a new token.
+# At least as long as 32 random bytes in base64. Nothing can see whether a text is random.
 _TEXT = re.compile(r"[A-Za-z0-9_-]{43,128}")
 
 
@@ -104,9 +104,16 @@ class Vault:
     ) -> tuple[str, Token]:
         """Create a token, and return its text, which is stored nowhere, and its record.
 
-        `text` is that of a token which several robots share; without it the token gets a new one.
-        Raises `UsageError` for a name or a text in use, and for a text that a stranger may guess.
+        `text` is that of a viewer's token which several robots share; without it the token gets a
+        new one. Raises `UsageError` for a name or a text in use, for a shared token of another
+        role, because whoever finds it could drive every robot, and for a text of another form.
         """
+        if text and role != "viewer":
+            raise UsageError(
+                f"--token is for the role viewer, not for the role {role}: many robots may share "
+                "such a token, and whoever finds it could drive them all. Leave out --token: then "
+                "each robot makes a token of its own"
+            )
         if text and not _TEXT.fullmatch(text):
             raise UsageError(
                 "a token has 43 to 128 characters of A-Z a-z 0-9 _ and -, at random: make one with "

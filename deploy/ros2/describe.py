@@ -48,29 +48,25 @@ def _urdf(text: str, robot: dict[str, Any], two: bool) -> str:
     radius, half = drive["wheel_radius"], drive["wheel_separation"] / 2
     x = 0.0 if two else HALF_WHEELBASE
     if two:
-        text = re.sub(r'  <(link|joint) name="rear_.*?</\1>\n\n?', "", text, flags=re.S)
-        text = re.sub(r' {4}<joint name="rear_.*?</joint>\n', "", text, flags=re.S)
+        text = _replace(text, r'(?m:^) *<(link|joint) name="rear_(?s:.*?)</\1>\n\n?', "")
     for place, side in SIDES.items():
+        if two and place.startswith("rear"):
+            continue
         at = f'<origin xyz="{x if place[0] == "f" else -x:g} {side * half:g} {radius:g}"'
-        text = re.sub(
-            rf'(<joint name="{place}_wheel_joint" type="continuous">.*?)<origin xyz="[^"]*"',
-            lambda found, at=at: found[1] + at,
-            text,
-            flags=re.S,
-        )
+        joint = rf'<joint name="{place}_wheel_joint" type="continuous">(?s:.*?)'
+        text = _replace(text, rf'(?P<kept>{joint})<origin xyz="[^"]*"', at)
         name = joints[place.partition("_")[2]] if two else joints[place]
-        text = text.replace(f'"{place}_wheel_joint"', f'"{name}"')
-    text = text.replace('radius="0.05"', f'radius="{radius:g}"')
-    text = text.replace('velocity="40.0"', f'velocity="{robot["limits"]["wheel_speed"]:g}"')
+        text = _replace(text, f'"{place}_wheel_joint"', f'"{name}"')
+    text = _replace(text, r'radius="0\.05"', f'radius="{radius:g}"')
+    text = _replace(text, r'velocity="40\.0"', f'velocity="{robot["limits"]["wheel_speed"]:g}"')
     x, y, yaw = (lidar[f"lidar_{name}"] for name in ("x_offset", "y_offset", "yaw"))
     at = f'<origin xyz="{x:g} {y:g} 0" rpy="0 0 {yaw:g}"/>'
-    text = re.sub(
-        r'(<child link="lidar_link"/>\s*)<origin [^>]*/>', lambda found: found[1] + at, text
-    )
-    text = text.replace('"base_link"', f'"{_link(robot["odometry"]["base_frame"])}"')
-    text = text.replace('"lidar_link"', f'"{_link(lidar["lidar_frame"])}"')
+    text = _replace(text, r'(?P<kept><child link="lidar_link"/>\s*)<origin [^>]*/>', at)
+    text = _replace(text, '"base_link"', f'"{_link(robot["odometry"]["base_frame"])}"')
+    text = _replace(text, '"lidar_link"', f'"{_link(lidar["lidar_frame"])}"')
     # The comment at the top is about the defaults.
-    return re.sub(r"<!--\n.*?-->\n", "<!-- Written by describe.py -->\n", text, count=1, flags=re.S)
+    head = "<!-- Written by describe.py -->\n"
+    return _replace(text, r"\A(?P<kept>[^\n]*\n)<!--\n(?s:.*?)-->\n", head)
 
 
 def _controllers(text: str, robot: dict[str, Any], two: bool) -> str:
@@ -110,9 +106,9 @@ def _controllers(text: str, robot: dict[str, Any], two: bool) -> str:
 def _nav2(text: str, robot: dict[str, Any]) -> str:
     limits, frames = robot["limits"], robot["odometry"]
     odom, base = frames["odom_frame"], frames["base_frame"]
-    text = text.replace("global_frame: odom\n", f"global_frame: {odom}\n")
+    text = _replace(text, "global_frame: odom\n", f"global_frame: {odom}\n")
     below = f"{base.removesuffix(_link(base))}base_footprint"
-    text = text.replace("base_frame_id: base_footprint\n", f"base_frame_id: {below}\n")
+    text = _replace(text, "base_frame_id: base_footprint\n", f"base_frame_id: {below}\n")
     x = max(HALF_CHASSIS, HALF_WHEELBASE + robot["drive"]["wheel_radius"])
     y = robot["drive"]["wheel_separation"] / 2 + HALF_TYRE
     corners = ((x, y), (x, -y), (-x, -y), (-x, y))
@@ -145,12 +141,18 @@ def _nav2(text: str, robot: dict[str, Any]) -> str:
 def _put(text: str, **values: Any) -> str:
     """Replace the value of each key, wherever it stands; JSON is YAML, too."""
     for key, value in values.items():
-        line = f"{key}: {json.dumps(value)}"
-        text, count = re.subn(
-            rf"^( *){re.escape(key)}: [^#\n]*", lambda m, line=line: m[1] + line, text, flags=re.M
+        pattern = rf"(?m:^)(?P<kept> *{re.escape(key)}: )[^#\n]*"
+        text = _replace(text, pattern, json.dumps(value))
+    return text
+
+
+def _replace(text: str, pattern: str, new: str) -> str:
+    """Replace what fits the pattern, except its group `kept`; exit if nothing fits."""
+    text, count = re.subn(pattern, lambda m: m.groupdict().get("kept", "") + new, text)
+    if not count:
+        raise SystemExit(
+            f"describe.py: a file has no text that fits {pattern!r}: take all files of one version"
         )
-        if not count:
-            raise SystemExit(f"describe.py: no line begins with {key}: take files of one version")
     return text
 
 

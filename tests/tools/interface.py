@@ -1,7 +1,7 @@
 """`python -m tests.tools.interface`: write down the public names of the version that is released.
 
-The names are those of the reference in the manual. `tests/test_interface.py` compares them with the
-names of the last release.
+Only the steps of a release run it, as `deploy/release/README.md` says. The names are those of the
+reference in the manual. `tests/test_interface.py` compares them with the names of the last release.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ def names_of(page: str, text: str) -> Iterator[str]:
 
 
 def released() -> set[str]:
-    """Return the names of the last release."""
+    """Return the names of the last release. Before the first one there is no such file."""
     lines = RELEASED.read_text().splitlines()
     return {line for line in lines if not line.startswith("#")}
 

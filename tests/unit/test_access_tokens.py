@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 
 from acsard.cli import main
+from acsard.core.values import Role
 from acsard.host import clock
 from acsard.host.errors import MendableError, UsageError
 from acsard.machine.authority import Authority
@@ -57,10 +58,18 @@ def test_one_token_may_open_the_pages_of_many_robots(tmp_path: Path) -> None:
         assert (found.role, found.name) == ("viewer", "prometheus")
         assert text not in vault.path.read_text()
     with pytest.raises(UsageError, match="already, as prometheus"):
-        vault.invite("maintainer", "other", 365, text=text)
+        vault.invite("viewer", "other", 365, text=text)
     vault.revoke("prometheus")
     assert owner(vault, text) is None
     assert owner(Vault(tmp_path / "robot1", "robot1"), text) is not None
+
+
+@pytest.mark.parametrize("role", ["operator", "maintainer"])
+def test_no_token_that_robots_share_lets_its_finder_drive_them(role: Role, tmp_path: Path) -> None:
+    vault, text = Vault(tmp_path, "robot1"), 32 * "a5"
+    with pytest.raises(UsageError, match=f"not for the role {role}.*Leave out --token"):
+        vault.invite(role, "all", 1, text=text)
+    assert owner(vault, text) is None
 
 
 @pytest.mark.parametrize("text", ["password", 42 * "a", 129 * "a", 42 * "a" + "\n", 43 * "ä"])

@@ -122,7 +122,7 @@ def test_a_hanging_gyro_s_heading_is_taken_back_or_in_the_covariance(
 
 
 @pytest.mark.parametrize("std", [GYRO_SCALE_STD, 0.02])
-@pytest.mark.parametrize("turns", [2, pytest.param(20, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("turns", [2, pytest.param(15, marks=pytest.mark.slow)])
 def test_the_error_of_a_gyros_scale_grows_with_the_turns(turns: int, std: float) -> None:
     bench = proved(1 + std)
     bench.robot.model = ErrorModel(OdometryConfig(gyro=True, gyro_scale_std=std), KINEMATICS, 3200)

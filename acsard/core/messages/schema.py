@@ -355,7 +355,7 @@ class SourceState(Message, frozen=True):
     angular: float | None = None
     """Turn rate in the last accepted command, rad/s; null like `age`."""
     longest_gap: float = 0.0
-    """Longest time between a speed and the next command of its sender in the last 30 to 60 s, s.
+    """Longest time from a speed to its sender's next accepted command in the last 30 to 60 s, s.
 
     In a gap above the timeout of the source the robot has braked. A gap above 5 s is the end of a
     drive, and does not count.

@@ -103,9 +103,10 @@ WARN senders
 WARN refused
     refused: {refused}
 WARN command_gaps
-    commands of {source} came up to {seconds:.1f} s apart, but count for {timeout:g} s: the robot
-    braked in between
-    -> if the program pauses, let a timer of its own repeat the last command; if the network does,
+    usable commands of {source} came up to {seconds:.1f} s apart, but count for {timeout:g} s: the
+    robot braked in between
+    -> look in `acsard top` whether commands were refused between them, and why. If the program
+    pauses, let a timer of its own repeat the last command; if the network delays or loses commands,
     run the program on the robot; `acsard echo state` shows longest_gap of each source
 WARN never_zero
     {source} sends {linear:.3f} m/s and {angular:.3f} rad/s, and no zero for over 3 s
