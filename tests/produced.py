@@ -81,19 +81,25 @@ def _hear(self: Robot, now: Instant, heard: Heard, hear: Callable[..., News] = R
 
 
 def _check(
-    wire: Any, operator: Any, config: Any, tell: Any, *more: Any, run: Any = procedure.run
+    wire: Any,
+    operator: Any,
+    config: Any,
+    tell: Any,
+    *more: Any,
+    run: Any = procedure.run,
+    **how: Any,
 ) -> None:
     def told(finding: Any) -> None:
         SEEN.add(finding.code)
         tell(finding)
 
-    run(wire, operator, config, told, *more)
+    run(wire, operator, config, told, *more, **how)
 
 
 def install() -> None:
     """Let the product report its codes."""
     Robot.hear = _hear  # type: ignore[method-assign]
-    procedure.run = _check  # type: ignore[assignment]
+    procedure.run = _check
     for module, name in (
         (outcomes, "find"),
         (summary, "waiting"),

@@ -428,7 +428,7 @@ class Board:
             letter=self.letters[motor],
             told=commanded,
             seen=speed,
-            most=motion.RUNAWAY_SPEED,
+            most=self.most_speed,
         )
         raise StoppedError(finding)
 
@@ -481,6 +481,7 @@ class Board:
             last = motion.since(self.replies[-2:], began_s)
             is_moving = any(motion.moving(reply.motors, motion.STANDING_SPEED) for reply in last)
             if len(last) == 2 and not (is_moving or motion.turning(self.replies, self.now_s)):
+                self.most_speed = motion.RUNAWAY_SPEED
                 return True
             patience_s = motion.SLOWING_TIMEOUT_S if self._slows() else motion.MOTOR_TIMEOUT_S
             if self.now_s - began_s >= patience_s:

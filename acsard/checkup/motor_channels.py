@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from itertools import pairwise
 from typing import Literal
 
 from msgspec import Struct, structs
@@ -216,6 +217,10 @@ LONG_GAP_S = 0.05
 
 REVERSALS = 6
 
+# A report below this share of the speed has a part of the reversal in it. With less, all of a
+# reversal could fall between the reports of momentary speeds.
+SEEN_REVERSAL = 0.85
+
 # Time over which the second, longer measurement of a speed averages the speed.
 LONG_MEASUREMENT_S = 0.75 * motion.MOTOR_TIMEOUT_S
 
@@ -255,15 +260,25 @@ def _unsure(board: Board, motor: int, seconds: float) -> float:
 def _jumps(board: Board, motor: int) -> bool:
     # Some firmware gives all edges since its last report the direction of the last edge. A right
     # report that is later than a reversal by some part of the time between reports shows almost
-    # no movement. So the reversals are spread over this time.
+    # no movement. So the reversals are spread over this time. The motor turns backward before.
     if board.gap_s < LONG_GAP_S:
         return False
-    least = math.inf
+    slowest, phases = list[float](), list[float]()
     for n in range(REVERSALS):
-        speeds = board.only([motor], motion.SPEED if n % 2 else -motion.SPEED)
-        replies = board.drive(speeds, (4 + n / REVERSALS) * board.gap_s)
-        least = min(least, *(abs(reply.motors[motor]) for reply in replies))
-    return least > motion.SPEED / 3
+        speeds = board.only([motor], -motion.SPEED if n % 2 else motion.SPEED)
+        began_s = board.now_s
+        replies = board.drive(speeds, (4 + 1 / REVERSALS) * board.gap_s)
+        slowest += [min((abs(reply.motors[motor]) for reply in replies), default=0.0)]
+        phases += [(reply.at_s - began_s) / board.gap_s % 1.0 for reply in replies[:1]]
+    # A right mean speed is below a third for at least a third of the reversal times. A board that
+    # answers only some lines may never be asked in this third.
+    phases.sort()
+    again = [phase + 1.0 for phase in phases[:1]]
+    spread = all(later - phase < 1 / 3 for phase, later in pairwise(phases + again))
+    # If a reversal is not seen at all, the motor may reverse between two right reports.
+    return (
+        spread and min(slowest) > motion.SPEED / 3 and max(slowest) < SEEN_REVERSAL * motion.SPEED
+    )
 
 
 def _look_s(board: Board) -> float:

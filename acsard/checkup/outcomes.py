@@ -59,11 +59,14 @@ FAIL? reply rate: none | too few replies
     the board leaves lines unanswered
     -> the firmware must answer every line, or report by its own clock
 
-PASS reply times: even | p50 {usual:.0f} ms, p99 {high:.0f} ms, max {longest:.0f} ms apart
-WARN? reply times: bunched | p50 {usual:.0f} ms, p99 {high:.0f} ms, max {longest:.0f} ms apart
-    {share:.0%} of the replies come in bunches behind silences: something blocks the firmware's
-    loop, so commands wait as long, and the pose is less certain
-    -> which library, delay() or print in the loop takes {longest:.0f} ms? Let the loop never wait
+PASS reply times: even | p50 {middle:.0f} ms, p99 {high:.0f} ms, max {longest:.0f} ms apart
+WARN? reply times: bunched | p50 {middle:.0f} ms, p99 {high:.0f} ms, max {longest:.0f} ms apart
+    {share:.0%} of the replies come in bunches behind silences of up to {longest:.0f} ms, so the
+    pose is less certain, and commands may wait as long: either the firmware's loop waits, or a USB
+    adapter, a hub or their driver holds the bytes back
+    -> try another USB port without a hub (`acsard doctor` checks the latency_timer of an adapter).
+    If the bunches stay: which library, delay() or print in the loop takes so long? Let the loop
+    never wait
 
 PASS round trip: right | p50 {middle:.1f} ms, max {longest:.1f} ms
 WARN? round trip: slow | p50 {middle:.1f} ms, max {longest:.1f} ms
@@ -163,10 +166,11 @@ FAIL? motor: one way | {figure}
     motor {here} shows movement in one direction only
     -> check the direction output of {here}'s driver, and A and B of its encoder
 WARN motor: last edge | {figure}
-    when motor {here} is reversed, its reported speed jumps over zero: the firmware gives all edges
-    of a report the direction of the last edge, or the motor reverses faster than the board reports.
-    Each reversal makes the pose wrong
-    -> count edges up and down by their direction, as the sketch of deploy/firmware does
+    at each of several reversals of motor {here}, the reported speed jumps over zero, although the
+    reports show that the motor slows down: either the firmware gives all edges of a report the
+    direction of the last edge, or it takes the direction from the command. Then each reversal makes
+    the pose wrong
+    -> count edges up and down by the direction of each edge, as the sketch of deploy/firmware does
 FAIL? motor: no sign | {figure}
     encoder {here} reports the same direction when motor {here} turns forward and backward
     -> is one of the two channels A and B of encoder {here} missing, or does the firmware lose the
@@ -229,13 +233,31 @@ WARN? top speed: short | {most:.1f} of {speed:.1f} rad/s
     -> write a lower limits.linear_speed or limits.angular_speed, or check the supply of the motors
 FAIL top speed: overflow | {most:.1f} at {speed:.1f} rad/s
     up to {below:.1f} rad/s the board reports the right direction; on the way to {speed:.1f} rad/s
-    this motor or these are reported backward: {motors}. A number in the firmware overflows, and the
-    daemon would take that for a wheel that turns the wrong way
-    -> compute and send speeds in a wider type (float, or 32 bits); until then write limits below
-    {below:.1f} rad/s
+    this motor or these are reported backward: {motors}. The daemon would take that for a wheel
+    that turns the wrong way. Either a number in the firmware overflows, or its interrupts miss
+    edges of the encoders at this speed, or the motor does turn backward
+    -> watch the wheel. If it turns forward, compute and send speeds in a wider type (float, or 32
+    bits), and count the edges in hardware, or fewer per turn; if not, check the driver and its
+    supply. Until then lower the limits, so that no wheel turns faster than {below:.1f} rad/s
+FAIL top speed: backward | {most:.1f} at {speed:.1f} rad/s
+    alone this motor or these turned forward as commanded, but together they are reported backward:
+    {motors}. Either lines or a driver reversed them meanwhile, or their encoders disturb each other
+    -> watch the wheels. If one turns backward, check the driver and its direction input, and let
+    the firmware set the direction from the sign of each whole line; if none does, check the leads
+    of the encoders
 SKIPPED top speed: no watchdog
-    the watchdog of the board is not known to work, so the check does not turn the motors fast
-    -> fix the watchdog above, and check again
+    the row of the watchdog does not show that it stops the motors in time and in every case, so the
+    check does not turn them fast
+    -> do what the row of the watchdog says, and check again
+SKIPPED top speed: damaged lines
+    the row of the damaged lines does not show that the motors are safe from them, so the check does
+    not turn them fast
+    -> do what the row of the damaged lines says, and check again
+SKIPPED top speed: not chosen
+    the configuration file does not set the highest speed of the motors, and no person confirmed
+    it: with the defaults it would be {top:.1f} rad/s
+    -> write limits.linear_speed and limits.angular_speed, or limits.wheel_speed, into the
+    configuration file; or leave --yes out: then the check asks
 SKIPPED top speed: untested
     no motor turned alone and at the commanded speed
     -> fix the motors above, and check again
@@ -307,11 +329,13 @@ PASS? damaged lines: right | {lines} lines, no motor moved
 WARN damaged lines: lenient | {took} of {kinds} kinds obeyed
     motors followed broken lines: {which}
     -> the firmware should accept a line whole or not at all
-FAIL damaged lines: inverted | {names} reversed for good
-    a line that was cut behind its sign reversed this motor or these: {names}. Since then good
-    lines turn it backward or not at all, and a single lost byte can do that while the robot drives
+FAIL damaged lines: inverted | {names} no longer turned forward
+    after damaged lines, the last one cut behind its sign, good lines turn this motor or these
+    backward or not at all: {names}. Either the firmware keeps a part of a line, so that a single
+    lost byte can do that while the robot drives, or a driver or its supply has cut out
     -> do not put this robot on the floor: flash the sketch of deploy/firmware, or let your firmware
-    set the direction from the sign of each whole line, and never toggle it
+    set the direction from the sign of each whole line, and never toggle it. If the motor stands,
+    check its driver, fuse and supply, too
 FAIL damaged lines: taken | {took} of {kinds} kinds obeyed
     motors followed broken lines: {which}; noise on a cable would drive the robot
     -> the firmware must accept a line whole or not at all, like deploy/firmware

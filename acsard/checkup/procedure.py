@@ -100,8 +100,13 @@ def run(
     config: Config,
     tell: Callable[[Finding], None],
     asleep_ns: Callable[[], int] = lambda: 0,
+    *,
+    fast: bool,
 ) -> None:
     """Check one microcontroller, and call `tell` with each finding as soon as it is known.
+
+    `fast` says whether a person chose the highest speed: in the file, or in answer to
+    `CONFIRMATION`.
 
     Only zeros are sent until the operator confirms that the wheels are lifted, and at the end.
     `asleep_ns` returns how long the computer has been suspended, which the clock of `wire` leaves
@@ -132,7 +137,7 @@ def run(
             watched = _Watched(operator, board, asleep_ns)
             board.abort_check = watched.check_operator
             radius = config.drive.wheel_radius
-            _Steps(board, watched, once, all_restarts, radius, top).all(config.safety)
+            _Steps(board, watched, once, all_restarts, radius, top, fast).all(config.safety)
     except StoppedError as end:
         once(end.finding)
         why = f"the check ended early: {end.finding.name}"
@@ -188,9 +193,10 @@ class _Steps:
         seen: list[Restart],
         radius: float,
         top: float,
+        fast: bool,
     ) -> None:
         self._board, self._operator, self._tell = board, operator, tell
-        self._radius, self._top = radius, top
+        self._radius, self._top, self._fast = radius, top, fast
         # All restarts of the board so far. The caller of `all` reads this list afterward.
         self._all_restarts = seen
         self._channels: list[Channel] = []
@@ -216,15 +222,22 @@ class _Steps:
         together = "the motors turn, then this computer sends nothing, perhaps several times"
         stops = self._measure(together, lambda: watchdog.finding(board, turned))
         broken = "sending damaged lines; a motor that turns now is a fault"
-        self._measure(broken, lambda: damage.finding(board, turned))
+        obeyed = self._measure(broken, lambda: damage.finding(board, turned))
         if board.repeats.encoders:
             # Only sound motors: one whose encoder shows too little would turn far faster.
-            rising = f"the motors turn up to {self._top:.1f} rad/s"
-            safe = stops is not None and stops.verdict in ("PASS", "WARN")
+            refusal = self._refusal(stops, obeyed)
+            rising = "" if refusal else f"the motors turn up to {self._top:.1f} rad/s"
             self._measure(
-                rising, lambda: top_speed.finding(board, right, safe, self._top, self._radius)
+                rising, lambda: top_speed.finding(board, right, refusal, self._top, self._radius)
             )
         self._take("", lambda: inputs.finding(board, operator, safety))
+
+    def _refusal(self, watchdog: Finding | None, damaged_lines: Finding | None) -> str:
+        if not _sound(watchdog):
+            return "no watchdog"
+        if not _sound(damaged_lines):
+            return "damaged lines"
+        return "" if self._fast else "not chosen"
 
     def _stop_and_arm(self) -> None:
         self._board.stop_motors()
@@ -347,6 +360,10 @@ class _Steps:
             self._all_restarts[-1] = structs.replace(self._all_restarts[-1], cause=cause)
         if board.armed:
             board.stop_motors()
+
+
+def _sound(finding: Finding | None) -> bool:
+    return finding is not None and lateness.judged(finding) and finding.verdict in ("PASS", "WARN")
 
 
 def _ended(step: Step) -> tuple[Finding | None, bool]:

@@ -1,6 +1,8 @@
-"""Measures when replies arrive: bunches behind a silence show a firmware that blocks its loop."""
+"""Measures when replies arrive: bunches behind silences show that something holds replies back."""
 
 from __future__ import annotations
+
+from statistics import fmean, median
 
 from acsard.checkup import lateness, motion, outcomes
 from acsard.checkup.board import Board
@@ -8,8 +10,8 @@ from acsard.checkup.findings import Finding
 
 MEASUREMENT_S = 2.0
 
-# A reply that comes within this share of the usual gap behind the one before belongs to a bunch,
-# and a silence is this many usual gaps.
+# A reply that comes within this share of the mean gap behind the one before belongs to a bunch,
+# and a silence is this many mean gaps.
 BUNCH_FRACTION, SILENCE_FACTOR = 0.3, 3.0
 
 MAX_BUNCHED = 0.03  # of the replies: a queue of this computer bunches single ones
@@ -23,12 +25,15 @@ def finding(board: Board) -> Finding | None:
     gaps = sorted(motion.gaps(board.drive(board.zero, MEASUREMENT_S, period_s)))
     if len(gaps) < 10:
         return None  # the row of the reply rate says so
-    usual_s, longest_s = gaps[len(gaps) // 2], gaps[-1]
-    bunched = sum(gap < BUNCH_FRACTION * usual_s for gap in gaps) / len(gaps)
+    # The median would be the gap inside a bunch if most replies come in bunches.
+    usual_s, longest_s = fmean(gaps), gaps[-1]
+    # The wire spreads a bunch.
+    close_s = max(BUNCH_FRACTION * usual_s, min(board.line_s, usual_s / 2))
+    bunched = sum(gap < close_s for gap in gaps) / len(gaps)
     blocks = bunched > MAX_BUNCHED and longest_s > SILENCE_FACTOR * usual_s
     return outcomes.find(
         f"reply times: {'bunched' if blocks else 'even'}",
-        usual=usual_s * 1000,
+        middle=median(gaps) * 1000,
         high=gaps[len(gaps) * 99 // 100] * 1000,
         longest=longest_s * 1000,
         share=bunched,

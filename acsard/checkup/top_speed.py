@@ -14,38 +14,43 @@ from acsard.checkup.findings import Finding, motor_names
 from acsard.checkup.motor_channels import FAIL_TOLERANCE
 from acsard.core.link.codec import Motors
 
-STEPS = 4  # speeds on the way to the highest one
+STEPS = 4  # speeds on the way to the highest one, after that of the other steps
 RAMP = 20.0  # rad/s2: the default acceleration on a wheel of 0.05 m
 # Replies in a row, so that a damaged line is no overflow, which report more than this share of the
 # command with the other sign.
 AGAINST, AGAINST_SHARE = 3, 0.25
 
 
-def finding(board: Board, motors: Sequence[int], safe: bool, top: float, radius: float) -> Finding:
+def finding(
+    board: Board, motors: Sequence[int], refusal: str, top: float, radius: float
+) -> Finding:
     """Raise the motors to `top` rad/s, and stop them; `radius` is of a wheel, m.
 
-    `safe` says whether the watchdog of the board works.
+    `refusal` is the outcome that forbids it, such as "no watchdog", or "".
     """
-    if not motors:
-        return outcomes.find("top speed: untested")
-    if not safe:
-        return outcomes.find("top speed: no watchdog")
+    if refusal or not motors:
+        return outcomes.find(f"top speed: {refusal if motors else 'untested'}", top=top)
+    # A motor that is backward at the speed at which it was right alone is not driven faster.
+    first = min(top, motion.SPEED)
+    rising = [top * step / STEPS for step in range(1, STEPS + 1)]
+    # `Board.settles` restores it when the motors stand still, also after a restart.
     board.most_speed = 1.5 * max(top, motion.SPEED)
     outcome, means, speed = "reached", board.zero, 0.0
-    for step in range(1, STEPS + 1):
-        right, speed, began = speed, top * step / STEPS, len(board.replies)
+    for following in (first, *(speed for speed in rising if speed > first)):
+        right, speed, began = speed, following, len(board.replies)
         means = _raise(board, motors, right, speed)
         recent = board.replies[began:]
         if any(_against(recent, motor, speed) for motor in motors):
-            outcome = "overflow"
+            outcome = "overflow" if right else "backward"
             break
-        if min(means[motor] for motor in motors) < (1 - FAIL_TOLERANCE) * speed:
+        # The first speed is too low for the short measurements of a coarse encoder.
+        judged = speed > first or speed == top
+        if judged and min(means[motor] for motor in motors) < (1 - FAIL_TOLERANCE) * speed:
             outcome = "short"
             break
     worst = min(motors, key=lambda motor: means[motor])
     slow = [motor for motor in motors if means[motor] < (1 - FAIL_TOLERANCE) * speed]
     board.stop_motors()
-    board.most_speed = motion.RUNAWAY_SPEED
     return outcomes.find(
         f"top speed: {outcome}",
         top=top,

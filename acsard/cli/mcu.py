@@ -10,17 +10,19 @@ from pathlib import Path
 
 import msgspec
 
-from acsard.checkup import procedure
+from acsard.checkup import motion, procedure
 from acsard.checkup.board import Wire
 from acsard.checkup.checkup_report import Changes, changes, report, summary, withheld
 from acsard.checkup.findings import Finding
 from acsard.cli.borrowed_port import BorrowedPort, Loan
 from acsard.cli.common import add_config, add_outcome, add_port, load
+from acsard.core.config.motion_rules import top_wheel_speed
+from acsard.core.config.parsing import toml_table
 from acsard.core.config.settings import SIMULATOR, Config
 from acsard.core.simulator.fake_mcu import FakeMcu
 from acsard.core.simulator.virtual_wire import VirtualWire
 from acsard.host import clock
-from acsard.host.config_file import change, writable
+from acsard.host.config_file import change, find, writable
 from acsard.host.errors import Exit, MendableError, UsageError
 from acsard.host.processes import master_of
 from acsard.host.terminal_modes import single_key_mode
@@ -35,8 +37,9 @@ port itself. If a daemon on this computer has the port open, and its robot rests
 switches the robot off and lends the port until the check ends; it must answer at the address in
 the configuration, and this user must be an operator or more. Otherwise the exit code is 75. The
 tool asks you to type that the wheels are lifted. Then it turns the motors one by one, and then all
-together. It commands at most 3 rad/s, and near the end, if the watchdog works, the highest speed of
-the configured limits. A wheel whose encoder is dead or reversed can reach full speed. If the board
+together. It commands at most 3 rad/s, and near the end, if the watchdog works and damaged lines are
+refused, the highest speed of the limits: the question names it, and with --yes the configuration
+file must set it. A wheel whose encoder is dead or reversed can reach full speed. If the board
 restarts during a test, the tool reports that and repeats the test. The check ends if the tool
 itself could not run for more than 3 s (5 s before the first motor test), for example because the
 computer was suspended. The tool always ends by sending zero speeds to the board, and sends nothing
@@ -65,7 +68,10 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     check.add_argument(
         "--wheels-are-lifted",
         action="store_true",
-        help="with --yes: confirm that no wheel touches anything and that you watch the robot",
+        help="with --yes: confirm that no wheel touches anything and that you watch the robot. The "
+        "motors turn at 3 rad/s, and near the end at the highest speed of the limits "
+        f"({top_wheel_speed(Config()):.0f} rad/s with the defaults), but only if the configuration "
+        "file sets limits.linear_speed and limits.angular_speed, or limits.wheel_speed",
     )
     add_outcome(check, "the settings that the check found, and the device of --port,")
 
@@ -77,12 +83,24 @@ def main(args: argparse.Namespace) -> int:
         writable(args.config)
         if why := withheld(config.mcu.simulated, configured):
             raise UsageError(f"--write cannot change {where}: {why}; leave --write out")
-    with _prompt(args, config.mcu.port) as prompt:
-        return _checked(args, config, configured, where, prompt)
+    # A person who answers questions confirms the speed. Defaults are nobody's choice.
+    fast = not args.yes or _sets_speed(find(args.config)[1])
+    with _prompt(args, config, fast) as prompt:
+        return _checked(args, config, configured, where, prompt, fast)
+
+
+def _sets_speed(text: bytes) -> bool:
+    limits = toml_table(text).get("limits", {})
+    return "wheel_speed" in limits or {"linear_speed", "angular_speed"} <= limits.keys()
 
 
 def _checked(
-    args: argparse.Namespace, config: Config, configured: Config, where: str, prompt: Prompt
+    args: argparse.Namespace,
+    config: Config,
+    configured: Config,
+    where: str,
+    prompt: Prompt,
+    fast: bool,
 ) -> int:
     # Suggests changes to the file `where`, whose values are `configured`, without options.
     port, simulated = config.mcu.port, config.mcu.simulated
@@ -106,7 +124,8 @@ def _checked(
         Loan(config, prompt.show_text) as loan,
     ):
         try:
-            procedure.run(_wire(config, loan), prompt, config, report_finding, clock.asleep_ns)
+            wire = _wire(config, loan)
+            procedure.run(wire, prompt, config, report_finding, clock.asleep_ns, fast=fast)
         except MendableError as error:
             if not args.json:
                 raise
@@ -131,8 +150,9 @@ def _checked(
     return Exit.OK if result.passed else Exit.FAILURE
 
 
-def _prompt(args: argparse.Namespace, port: str) -> Prompt:
+def _prompt(args: argparse.Namespace, config: Config, fast: bool) -> Prompt:
     # Raises `UsageError` if wheels could turn without a person's consent.
+    port = config.mcu.port
     if port == SIMULATOR and args.port != SIMULATOR:
         raise UsageError(
             "no port is configured, so there is no board to check (mcu.port is the simulator, "
@@ -150,11 +170,12 @@ def _prompt(args: argparse.Namespace, port: str) -> Prompt:
         return Prompt(args.json)
     master = master_of(port)
     if master is None or master.name != "acsard":
+        most = max(motion.SPEED, top_wheel_speed(config) if fast else 0.0)
         what = f"a pty of {master.name}" if master else "not a simulator of acsard"
         raise UsageError(
             f"{port} is {what}: a robot may be connected to it, and --yes would turn its wheels "
-            "without a question. Either leave --yes out, or lift the wheels, stay with the robot "
-            "and add --wheels-are-lifted",
+            f"at up to {most:.0f} rad/s without a question. Either leave --yes out, or lift the "
+            "wheels, stay with the robot and add --wheels-are-lifted",
         )
     return Prompt(args.json)
 

@@ -127,7 +127,7 @@ def test_the_operator_s_answers_become_the_wheel_map(
 @pytest.mark.nightly  # a busy machine runs the check too late
 @pytest.mark.parametrize("text", ["", TWO_WHEELS], ids=["four", "two"])
 def test_every_row_of_a_sound_board_is_measured_in_real_time(tmp_path: Path, text: str) -> None:
-    (tmp_path / "acsard.toml").write_text(text)
+    (tmp_path / "acsard.toml").write_text(f"{text}[limits]\nwheel_speed = 20.0\n")
     with Program(acsard("sim", "--link", "mcu"), tmp_path) as sim:
         sim.says("acsard run --port")
         config, port = str(tmp_path / "acsard.toml"), str(tmp_path / "mcu")

@@ -192,13 +192,13 @@ class Person(Nobody):
 class Checked:
     """The findings of a check of one robot."""
 
-    def __init__(self, robot: Robot, person: bool | Person = False) -> None:
+    def __init__(self, robot: Robot, person: bool | Person = False, fast: bool = True) -> None:
         self.findings: list[Finding] = []
         operator = person or Nobody()
         if operator is True:
             operator = Person(robot)
         with robot.faulty():
-            procedure.run(robot, operator, robot.config, self.findings.append)
+            procedure.run(robot, operator, robot.config, self.findings.append, fast=fast)
             self.left_turning = any(robot.later())
         self.changes = checkup_report.changes(self.findings, robot.config)
 

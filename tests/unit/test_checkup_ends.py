@@ -45,7 +45,7 @@ def test_only_zeros_are_sent_until_the_wheels_are_confirmed_to_be_lifted(config:
             return None
 
     findings: list[Finding] = []
-    procedure.run(robot, Refuses(), robot.config, findings.append)
+    procedure.run(robot, Refuses(), robot.config, findings.append, fast=True)
     assert [finding.name for finding in findings if finding.verdict != "SKIPPED"] == ["wheels"]
     assert all(line in zeros for data in robot.sent for line in data.splitlines(True))
     assert not robot.is_open
@@ -66,7 +66,7 @@ def test_a_q_typed_while_a_motor_turns_ends_the_check(typed: str) -> None:
             return super().ask(question, answers)
 
     with robot.faulty(), pytest.raises(KeyboardInterrupt):
-        procedure.run(robot, Quits(robot), robot.config, lambda finding: None)
+        procedure.run(robot, Quits(robot), robot.config, lambda finding: None, fast=True)
     top = top_wheel_speed(robot.config)
     assert questions == [procedure.CONFIRMATION.format(top=top)]
     assert b"".join(robot.sent[-5:]).count(stop_lines(robot.config)[0]) == FINAL_ZEROS
@@ -127,7 +127,9 @@ def test_a_check_that_stalled_while_a_motor_turned_turns_no_motor_again(
             return super().ask(question, answers)
 
     findings: list[Finding] = []
-    procedure.run(robot, Away(robot), robot.config, findings.append, lambda: robot.asleep_ns)
+    procedure.run(
+        robot, Away(robot), robot.config, findings.append, lambda: robot.asleep_ns, fast=True
+    )
     assert robot.stalled
     assert robot.turned_after == []
     stopped, rest = findings[-2:]
@@ -145,7 +147,9 @@ def test_before_a_wheel_has_turned_only_a_long_stall_ends_the_check(
     seconds: float, ends: bool, asleep: bool
 ) -> None:
     robot, findings = Stalls(seconds, asleep=asleep, turning=0), list[Finding]()
-    procedure.run(robot, Nobody(), robot.config, findings.append, lambda: robot.asleep_ns)
+    procedure.run(
+        robot, Nobody(), robot.config, findings.append, lambda: robot.asleep_ns, fast=True
+    )
     assert robot.stalled
     failed = [finding.name for finding in findings if finding.verdict in ("FAIL", "WARN")]
     assert failed == (["stall"] if ends else [])
@@ -175,7 +179,7 @@ def test_whatever_ends_the_check_the_last_lines_are_zeros_in_both_forms(
     error = KeyboardInterrupt if number % 2 else RuntimeError
     robot = Trouble(number, error(), fault, "no_watchdog", config=config)
     with robot.faulty(), pytest.raises(error):
-        procedure.run(robot, Nobody(), robot.config, lambda finding: None)
+        procedure.run(robot, Nobody(), robot.config, lambda finding: None, fast=True)
     last = b"".join(robot.sent[-5:])
     assert [last.count(line) for line in stop_lines(config)] == [5, 5]
     with robot.faulty():
@@ -196,7 +200,7 @@ def test_a_signal_during_the_last_zeros_does_not_stop_them() -> None:
 
     robot = Interrupted("plain_only")
     with robot.faulty(), pytest.raises(KeyboardInterrupt):
-        procedure.run(robot, Nobody(), robot.config, lambda finding: None)
+        procedure.run(robot, Nobody(), robot.config, lambda finding: None, fast=True)
     assert b"".join(robot.sent[-5:]).count(stop_lines(robot.config)[1]) == 5
     assert not robot.is_open
 

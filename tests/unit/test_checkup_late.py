@@ -137,7 +137,7 @@ def test_a_later_step_reports_a_fault_that_an_earlier_step_could_not_judge() -> 
     vars(robot.mcu)["understand"] = obeys
     findings: list[Finding] = []
     with robot.faulty():
-        procedure.run(robot, Sees(), robot.config, findings.append)
+        procedure.run(robot, Sees(), robot.config, findings.append, fast=True)
     matches = [finding for finding in findings if finding.name == "trailing comma"]
     assert [finding.figure for finding in matches] == ["not judged", "needed"]
     assert matches[1].keys == {"mcu.trailing_comma": True}

@@ -5,16 +5,24 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Sequence
 
+import pytest
 from msgspec.structs import replace
 
-from acsard.checkup import reply_times, top_speed
-from acsard.checkup.motor_channels import Channel, wheel_map
-from acsard.core.config.settings import Config, LimitsConfig
+from acsard.checkup import dialect, lateness, procedure, reply_times, top_speed
+from acsard.checkup.findings import Finding, StoppedError
+from acsard.checkup.motor_channels import Channel, channel, wheel_map
+from acsard.checkup.restarts import RestartedError
+from acsard.core.config.settings import Config, LimitsConfig, SimConfig
 from tests.each import each
 from tests.unit.checkup_robots import FOUR_AND_TWO, MS, Checked, Robot, check
+from tests.unit.test_checkup_lines import ByItsOwnClock
 
 VALUE = re.compile(rb"([pn])(\d\d\.\d\d)")
 TOP = 20.0
+
+
+def lagging(seconds: float) -> Config:
+    return Config(sim=SimConfig(motor_time_constant=seconds))
 
 
 class Reported(Robot):
@@ -50,7 +58,7 @@ def test_the_speeds_up_to_that_of_the_limits_are_compared(
 ) -> None:
     robot = Reported(change, config)
     with robot.board() as board:
-        found = top_speed.finding(board, range(len(board.letters)), True, TOP, 0.05)
+        found = top_speed.finding(board, range(len(board.letters)), "", TOP, 0.05)
         assert max(map(abs, robot.mcu.vehicle.speeds)) < 0.1
         assert board.most_speed == 6.0
     assert found.code == code
@@ -58,23 +66,112 @@ def test_the_speeds_up_to_that_of_the_limits_are_compared(
         assert "10.0 rad/s" in found.text
 
 
-def test_a_board_without_a_watchdog_is_not_driven_fast() -> None:
-    with Robot("no_watchdog").board() as board:
-        assert top_speed.finding(board, [0], False, TOP, 0.05).code == "top_speed_no_watchdog"
-        assert top_speed.finding(board, [], True, TOP, 0.05).code == "top_speed_untested"
+def fastest(robot: Robot) -> float:
+    return max(float(value) for line in robot.sent for _, value in VALUE.findall(line))
+
+
+@each(
+    ("faults", "fast", "code"),
+    [
+        (("no_watchdog",), True, "top_speed_no_watchdog"),
+        (("late_watchdog",), True, "top_speed_no_watchdog"),
+        (("toggled_direction",), True, "top_speed_damaged_lines"),
+        ((), False, "top_speed_not_chosen"),
+        ((), True, "top_speed_reached"),
+    ],
+)
+def test_only_a_sound_board_is_driven_fast_and_only_if_a_person_chose_the_speed(
+    faults: tuple[str, ...], fast: bool, code: str
+) -> None:
+    robot = Robot("plain_only", *faults)
+    checked = Checked(robot, fast=fast)
+    assert checked["top speed"].code == code
+    assert (fastest(robot) > 3.0) is (code == "top_speed_reached")
+
+
+def test_a_watchdog_or_damaged_lines_that_were_not_judged_are_not_sound() -> None:
+    for late in (lateness.finding("watchdog", 0.1), None):
+        assert not procedure._sound(late)
+    assert procedure._sound(Finding("damaged lines", "PASS"))
+
+
+def test_a_motor_that_is_backward_from_the_start_is_not_driven_faster_and_is_no_overflow() -> None:
+    robot = Robot("plain_only", "toggled_direction")
+    with robot.board() as board:
+        board.wire.send(f"{board.letters[0]}n\r\n".encode())
+        board.stop_motors()
+        found = top_speed.finding(board, [0, 1], "", TOP, 0.05)
+    assert found.code == "top_speed_backward"
+    assert "motor a" in found.text
+    assert "overflow" not in found.text
+    assert fastest(robot) == 3.0
+
+
+def test_a_runaway_is_judged_by_the_speed_of_the_step_until_the_motors_stand() -> None:
+    robot = Reported(lambda speed: 4 * speed if speed > 15 else speed)
+    with robot.board() as board:
+        with pytest.raises(StoppedError) as end:
+            top_speed.finding(board, [0], "", TOP, 0.05)
+        assert "more than 30 rad/s" in end.value.finding.text
+
+
+def test_a_restart_at_high_speed_leaves_the_high_bound_until_the_motors_stand() -> None:
+    robot = Robot("plain_only")
+    with robot.board() as board:
+        board.abort_check = lambda: resets(robot)
+        with pytest.raises(RestartedError):
+            top_speed.finding(board, [0], "", TOP, 0.05)
+        assert board.most_speed == 1.5 * TOP
+        board.abort_check = lambda: None
+        board.forget()
+        assert board.comes_back()
+        board.stop_motors()
+        assert board.most_speed == 6.0
+
+
+def resets(robot: Robot) -> None:
+    if robot.mcu.vehicle.speeds[0] > 15.0:
+        robot.mcu.reset(robot.now_ns(), 300 * MS)
+
+
+@each("seconds", [0.02, 0.05, 0.1])
+@each(
+    ("robot", "faults"),
+    [
+        (Robot, ("free_running",)),
+        (ByItsOwnClock, ("free_running",)),
+        (Robot, ("sparse_replies",)),
+        (ByItsOwnClock, ("sparse_replies",)),
+    ],
+)
+def test_seldom_reports_of_a_right_board_are_not_taken_for_wrong_directions(
+    robot: type[Robot], faults: tuple[str, ...], seconds: float
+) -> None:
+    with robot(*faults, "plain_only", config=lagging(seconds)).board() as board:
+        dialect.rate(board)
+        for motor in (0, 1):
+            assert channel(board, motor).kind != "last edge"
+
+
+@each("seconds", [0.03, 0.05])
+def test_directions_of_the_last_edge_are_found(seconds: float) -> None:
+    with Robot("free_running", "last_edge", config=lagging(seconds)).board() as board:
+        dialect.rate(board)
+        assert channel(board, 0).kind == "last edge"
 
 
 class Blocking(Robot):
-    """A firmware whose loop stands still for `block_s` twice a second, and then answers all."""
+    """A firmware whose loop stands still for `block_s` in each `every_s`, and then answers all."""
 
-    def __init__(self, block_s: float) -> None:
+    def __init__(self, block_s: float, every_s: float) -> None:
         super().__init__("plain_only")
         self._block_ns, self._held = int(block_s * 1e9), list[bytes]()
+        self._every_ns = int(every_s * 1e9)
 
     def listen(self, until_ns: int) -> list[tuple[int, bytes]]:
         pieces = []
         for at_ns, data in super().listen(until_ns):
-            if at_ns % (500 * MS) < self._block_ns:
+            if at_ns % self._every_ns < self._block_ns:
                 self._held.append(data)
                 continue
             pieces += [(at_ns + n * MS // 2, held) for n, held in enumerate(self._held)]
@@ -84,17 +181,24 @@ class Blocking(Robot):
 
 
 @each(
-    ("block_s", "code"),
-    [(0.0, "reply_times_even"), (0.01, "reply_times_even"), (0.08, "reply_times_bunched")],
+    ("block_s", "every_s", "code"),
+    [
+        (0.0, 0.5, "reply_times_even"),
+        (0.01, 0.5, "reply_times_even"),
+        (0.08, 0.5, "reply_times_bunched"),
+        # Most gaps are those inside a bunch.
+        (0.06, 0.1, "reply_times_bunched"),
+        (0.08, 0.1, "reply_times_bunched"),
+    ],
 )
-def test_a_firmware_that_blocks_its_loop_answers_in_bunches(block_s: float, code: str) -> None:
-    with Blocking(block_s).board() as board:
+def test_replies_behind_silences_come_in_bunches(block_s: float, every_s: float, code: str) -> None:
+    with Blocking(block_s, every_s).board() as board:
         board.paced = True
         found = reply_times.finding(board)
     assert found is not None
     assert found.code == code
     if code == "reply_times_bunched":
-        assert float(found.figure.split("max ")[1].split()[0]) > 70
+        assert float(found.figure.split("max ")[1].split()[0]) > 900 * block_s - 5
 
 
 def answered(wheels: Sequence[str | None], **faulty: int) -> list[Channel]:

@@ -29,6 +29,7 @@ from acsard.core.simulator.fake_mcu import FakeMcu
 from acsard.core.simulator.virtual_wire import VirtualWire
 from acsard.host.errors import Exit, InUseError, MendableError, NoPortError, UsageError
 from acsard.terminal.prompt import ended_by_signals
+from tests.each import each
 
 
 def called(where: Path, *words: str, text: str = "") -> int:
@@ -133,7 +134,7 @@ def test_a_robot_whose_file_the_check_changed_stays_switched_off(
 
     def run(
         wire: BorrowedPort, operator: object, config: Config, tell: Callable[[Finding], None],
-        *_: object,
+        *_: object, **how: object,
     ) -> None:  # fmt: skip
         wire._loan.begin(InUseError("in use"))
         tell(Finding("baud rate", "PASS", keys={"mcu.wheels.front_left": "-b"}))
@@ -164,12 +165,35 @@ def test_yes_alone_is_refused_on_what_is_no_simulator(tmp_path: Path) -> None:
     ends = pty.openpty()
     try:
         for port in (os.ttyname(ends[1]), "/dev/null"):
-            with pytest.raises(UsageError, match="--wheels-are-lifted") as end:
-                called(tmp_path, "--yes", "--port", port)
-            assert end.value.code == Exit.USAGE
+            for text, speed in (("", 3), ("[limits]\nwheel_speed = 12.0\n", 12)):
+                (tmp_path / "acsard.toml").write_text(text)
+                with pytest.raises(UsageError, match="--wheels-are-lifted") as end:
+                    called(tmp_path, "--yes", "--port", port)
+                assert end.value.code == Exit.USAGE
+                assert f"at up to {speed} rad/s" in str(end.value)
     finally:
         for end_fd in ends:
             os.close(end_fd)
+
+
+@each(
+    ("text", "fast"),
+    [
+        ("", False),
+        ("linear_speed = 0.2", False),
+        ("linear_acceleration = 0.2", False),
+        ("linear_speed = 0.2\nangular_speed = 1.0", True),
+        ("wheel_speed = 12.0", True),
+    ],
+)
+def test_without_questions_only_a_speed_of_the_file_is_driven(
+    text: str, fast: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "acsard.toml").unlink(missing_ok=True)
+    run = MagicMock()
+    monkeypatch.setattr(procedure, "run", run)
+    called(tmp_path, "--port", "sim", "--yes", text=f"[limits]\n{text}\n")
+    assert run.call_args.kwargs == {"fast": fast}
 
 
 def on_terminal(columns: int, do: Callable[[], object], monkeypatch: pytest.MonkeyPatch) -> str:

@@ -30,7 +30,7 @@ def parse(text: bytes, overrides: dict[str, dict[str, object]] | None = None) ->
 
     Raises `ConfigError`, which lists every mistake.
     """
-    table = _table(text)
+    table = toml_table(text)
     for section, values in (overrides or {}).items():
         inner = table.setdefault(section, {})
         if isinstance(inner, dict):
@@ -43,10 +43,11 @@ def parse_recorded(text: bytes) -> Config:
 
     Keys that this version does not have are ignored. Raises `ConfigError`.
     """
-    return _checked(known_part(Config, _table(text)))
+    return _checked(known_part(Config, toml_table(text)))
 
 
-def _table(text: bytes) -> dict[str, Any]:
+def toml_table(text: bytes) -> dict[str, Any]:
+    """Return what the file sets, without defaults. Raises `ConfigError` if it is not TOML."""
     if len(text) > MAX_BYTES:
         raise ConfigError(
             [f"more than {MAX_BYTES} bytes: too large for a configuration; shorten the file"]
