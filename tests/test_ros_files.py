@@ -113,7 +113,8 @@ def robot(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFacto
     (where / "robot.json").write_bytes(msgspec.json.encode(effective(config)))
     words = [sys.executable, str(FILES / "describe.py"), "robot.json", "my_robot"]
     subprocess.run(words, cwd=where, check=True, timeout=20)
-    assert (where / "my_robot/acsar.launch.py").read_text() == LAUNCH.read_text()
+    for name in ("acsar.launch.py", "acsar.rviz", "nav2.py"):
+        assert (where / "my_robot" / name).read_bytes() == (FILES / name).read_bytes()
     return Described(config, where / "my_robot")
 
 

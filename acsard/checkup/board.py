@@ -98,9 +98,8 @@ class Board:
     """
 
     def __init__(self, wire: Wire, mcu: McuConfig, rate_hz: float, encoders: bool = True) -> None:
-        self.wire, self.mcu, self.rate_hz = wire, mcu, rate_hz
-        self.letters = mcu.wheels.letters  # of the motors, which have the numbers from 0 on
-        self.zero = self.only(())
+        self.wire, self.rate_hz = wire, rate_hz
+        self.take_motors(mcu)
         self.repeats = Repeats(encoders)
         # Whether the check has seen all motors stand still. From then on, the check ends if a motor
         # runs away or if the board falls silent.
@@ -146,7 +145,6 @@ class Board:
         # rad/s, above which a motor runs away
         self.most_speed = motion.RUNAWAY_SPEED
 
-        self._commanded = self.zero
         # Time for which `drive` has sent lines since the last reply. If this computer is late, only
         # one line period of its delay counts, because a delay does not show a silent board.
         self._unanswered_s = 0.0
@@ -154,6 +152,12 @@ class Board:
         self._sequence = 0
         self._lines = LineReader()
         self.restarts = Restarts()
+
+    def take_motors(self, mcu: McuConfig) -> None:
+        """Send and understand lines of the motors in `mcu` from now on."""
+        self.mcu = mcu
+        self.letters = mcu.wheels.letters  # of the motors, which have the numbers from 0 on
+        self.zero = self._commanded = self.only(())
         self._codecs = {comma: MotorCodec(self.letters, comma) for comma in (False, True)}
 
     def open(self, baud_rate: int) -> None:

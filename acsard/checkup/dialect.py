@@ -10,18 +10,21 @@ import re
 from statistics import fmean, median
 from typing import get_args
 
+from msgspec.structs import asdict, replace
+
 from acsard.checkup import lateness, motion, outcomes
 from acsard.checkup.board import Board
 from acsard.checkup.findings import Finding, StoppedError, motor_name
 from acsard.checkup.motion import BOOT_S, SHORT_MEASUREMENT_S, WATCHDOG_SILENCE_S, BoardReply
 from acsard.core.codes import CODES
-from acsard.core.config.settings import MAX_REPLY_PERIOD_S, Baud
+from acsard.core.config.settings import MAX_REPLY_PERIOD_S, Baud, WheelMap
 from acsard.core.config.wire_time import COMFORTABLE_USE, highest_rate, line_bytes
 from acsard.core.formatting import printable_bytes
+from acsard.core.link.board_status import IDENTITY
 from acsard.core.link.checked_line import seal
 from acsard.core.link.link_diagnosis import MAX_SHOWN_BYTES, is_text
 from acsard.core.link.link_state import GOOD_LINES
-from acsard.core.link.session import IDENTITY
+from acsard.core.values import TWO_WHEELS, WHEELS
 
 
 def baud(board: Board) -> Finding:
@@ -37,6 +40,8 @@ def baud(board: Board) -> Finding:
     if _knock(board, BOOT_S):
         return outcomes.find("baud rate: right", {"mcu.baud_rate": configured}, rate=configured)
     data = board.traffic
+    if finding := _other_motors(board):
+        return finding
     for rate in (rate for rate in reversed(get_args(Baud)) if rate != configured):
         board.open(rate)
         if _knock(board, 0.6):
@@ -47,12 +52,39 @@ def baud(board: Board) -> Finding:
                 configured=configured,
                 heard=data.counted,
             )
+        if finding := _other_motors(board):
+            return finding
     board.open(configured)
     # The daemon says the same about bytes that are no good lines.
     why = data.reason(f"at {configured} baud {{}}; no good line at any other rate")
     figure = CODES[why.code].figure
     raise StoppedError(
         Finding("baud rate", "FAIL", figure, why.text.rstrip(";"), why.advice, {}, why.code)
+    )
+
+
+def _other_motors(board: Board) -> Finding | None:
+    # Firmware rejects lines with another number of values, and need not say so.
+    mcu, four = board.mcu, len(board.letters) == len(WHEELS)
+    wheels = WheelMap(right="+a", left="+b") if four else WheelMap()
+    board.take_motors(replace(mcu, wheels=wheels))
+    answered = False
+    try:
+        answered = _knock(board, 0.6)
+    finally:  # the board may restart meanwhile
+        if not answered:
+            board.take_motors(mcu)
+    if not answered:
+        return None
+    return outcomes.find(
+        "baud rate: other motors",
+        {"mcu.baud_rate": board.baud_rate}
+        | {f"mcu.wheels.{name}": motor for name, motor in asdict(wheels).items()},
+        rate=board.baud_rate,
+        motors=len(wheels.names),
+        line=board.example,
+        configured=len(mcu.wheels.names),
+        entries=" and ".join(f'{name} = "{getattr(wheels, name)}"' for name in TWO_WHEELS),
     )
 
 

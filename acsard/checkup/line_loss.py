@@ -17,8 +17,8 @@ from acsard.checkup.findings import Finding, StoppedError
 from acsard.checkup.motion import BoardReply
 from acsard.core.config.wire_time import COMFORTABLE_USE, highest_rate, line_bytes
 from acsard.core.formatting import printable_bytes
+from acsard.core.link.board_status import IDENTITY
 from acsard.core.link.link_diagnosis import MAX_SHOWN_BYTES, is_text
-from acsard.core.link.session import IDENTITY
 
 # Largest fraction of lost lines that the check accepts. A good link loses no line.
 MAX_LOSS = 0.02

@@ -14,6 +14,10 @@ PASS baud rate: right | {rate} baud
 FAIL baud rate: other | {rate}, not {configured} baud
     {heard} at the configured {configured} baud; good lines at {rate}
     -> write mcu.baud_rate = {rate}; the check goes on with it
+FAIL baud rate: other motors | {rate} baud, but {motors} motors
+    the board answers lines of {motors} values such as `{line}`, and none of {configured}
+    -> write {entries} into [mcu.wheels]; the check goes on with it, and finds out which motor turns
+    which wheel
 
 PASS identification: named | {short}
     {text}

@@ -128,8 +128,9 @@ def run(
 
     why = ""
     all_restarts: list[Restart] = []
+    board = Board(wire, config.mcu, config.rate_hz, config.feedback.encoders)
     try:
-        with Board(wire, config.mcu, config.rate_hz, config.feedback.encoders) as board:
+        with board:
             board.zeros()
             top = top_wheel_speed(config)
             if operator.ask(CONFIRMATION.format(top=max(3, top)), (LIFTED,)) != LIFTED:
@@ -145,8 +146,8 @@ def run(
         once(outcomes.find("serial line: lost", error=lost))
         why = "the check ended early: the serial line was lost"
     if all_restarts:
-        once(restarts.finding(config.mcu, all_restarts))
-    motors = [motor_name(config.mcu, n) for n in range(len(config.mcu.wheels.letters))]
+        once(restarts.finding(board.mcu, all_restarts))
+    motors = [motor_name(board.mcu, n) for n in range(len(board.letters))]
     names = ["motors"] if finding_names.isdisjoint(motors) else motors
     steps = [name for step in STEPS for name in (names if step == "motors" else [step])]
     rest = [step for step in steps if step not in finding_names]

@@ -16,8 +16,8 @@ from acsard.checkup import outcomes
 from acsard.checkup.findings import Finding, motor_names
 from acsard.checkup.motion import BOOT_S, SHORT_MEASUREMENT_S, BoardReply
 from acsard.core.config.settings import McuConfig
+from acsard.core.link.board_status import IDENTITY
 from acsard.core.link.codec import Motors
-from acsard.core.link.session import IDENTITY
 from acsard.core.values import AcsardError, Seconds
 
 # A later identification was sent without a request, because the board booted.

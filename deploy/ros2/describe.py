@@ -4,8 +4,8 @@
     python3 describe.py robot.json DIRECTORY     # where ROS runs; it needs no ROS
 
 The directory gets acsar.urdf, controllers.yaml, nav2_params.yaml and ekf.yaml with the robot's
-values, and acsar.launch.py and acsar.rviz as they are. A frame such as robot1/base_link becomes the
-link base_link: give the part before it to the launch file, `frame_prefix:=robot1/`.
+values, and acsar.launch.py, acsar.rviz and nav2.py as they are. A frame such as robot1/base_link
+becomes the link base_link: give the part before it to the launch file, `frame_prefix:=robot1/`.
 """
 
 import json
@@ -168,5 +168,5 @@ if __name__ == "__main__":
     out.mkdir(parents=True, exist_ok=True)
     for name, text in texts.items():
         (out / name).write_text(text, encoding="utf-8")
-    for name in ("acsar.launch.py", "acsar.rviz"):
+    for name in ("acsar.launch.py", "acsar.rviz", "nav2.py"):
         shutil.copy(HERE / name, out)

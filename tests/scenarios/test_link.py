@@ -213,7 +213,8 @@ def test_a_stall_of_this_computer_does_not_stop_the_robot_without_a_ramp(stall: 
     ("wheels", "motors"), [(TWO, FOUR), (FOUR, TWO), (TWO, WheelMap(left="+a", right="+b"))]
 )
 @pytest.mark.parametrize(
-    ("reports", "code"), [(0.01, "received_letters"), (0.0, "received_nothing")]
+    ("reports", "code"),
+    [(0.01, "received_letters"), (0.0, "received_nothing"), (0.0, "received_identity")],
 )
 def test_a_board_with_other_motors_is_never_driven_and_the_advice_names_the_setting(
     wheels: WheelMap, motors: WheelMap, reports: float, code: str
@@ -223,9 +224,11 @@ def test_a_board_with_other_motors_is_never_driven_and_the_advice_names_the_sett
     world = World(config, plugged=False)
     board = FakeMcu(Config(mcu=McuConfig(wheels=motors)), world.now_ns)
     world.port.plug(board)
+    if code == "received_identity":
+        board.reset(world.now_ns)
     with board.fault("free_running", 0.01) if reports else nullcontext():
         world.run(0.5)
-        world.drive(0.5, seconds=4.0)
+        world.drive(0.5, seconds=8.0)
     assert (world.state.link, world.state.code) == ("booting", code)
     assert "mcu.wheels" in world.state.reason
     assert board.vehicle.set_points == [0.0] * 4

@@ -48,6 +48,9 @@ def at_baud(rate: Any) -> Config:
 COURSE = Config(mcu=structs.replace(TWO_WHEELS.mcu, trailing_comma=True, reply_period=0.1))
 
 
+SKETCH = Config(mcu=McuConfig(wheels=WheelMap(right="+a", left="+b")))
+
+
 def with_lag(seconds: float) -> Config:
     return structs.replace(COURSE, sim=SimConfig(motor_time_constant=seconds))
 
@@ -119,6 +122,10 @@ BOARDS: dict[str, dict[str, tuple[str, dict[str, Any], bool]]] = {
         "other letters": ("free_running", {"config": TWO_WHEELS, "wheels": WheelMap()}, False),
         "letters of four": (
             "free_running", {"wheels": TWO_WHEELS.mcu.wheels}, False),
+        "lines of two": ("no_check", {"config": SKETCH, "wheels": WheelMap("-a")}, True),
+        "lines of two at another rate": (
+            "wrong_baud=57600", {"config": SKETCH, "wheels": WheelMap()}, True),
+        "lines of four": ("", {"wheels": SKETCH.mcu.wheels}, True),
     },
     "course": {
         "plain": ("free_running plain_only", {"config": COURSE}, True),

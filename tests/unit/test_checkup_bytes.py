@@ -8,6 +8,8 @@ from acsard.core.codes import CODES
 from tests.each import each
 from tests.unit.checkup_robots import Checked, Robot
 
+SKETCH = b"!acsard-mcu sketch watchdog_ms=300 counts=748\r\n"
+
 
 class Sends(Robot):
     """A device that sends other bytes in place of each reply; `n` counts the replies."""
@@ -32,6 +34,8 @@ class Sends(Robot):
     [
         (lambda reply, n: b"", "received_nothing"),
         (lambda reply, n: b"!status estop=0\r\n", "received_statuses"),
+        (lambda reply, n: SKETCH if n == 1 else b"", "received_identity"),
+        (lambda reply, n: SKETCH + b"!status estop=ok\r\n", "received_identity"),
         (lambda reply, n: b"motor loop ok\r\n", "received_text"),
         (lambda reply, n: b"a 0.0, b 0.0, c 0.0, d 0.0\r\n", "received_form"),
         (lambda reply, n: reply.replace(b"d", b"e"), "received_letters"),

@@ -16,8 +16,8 @@ from acsard.checkup.restarts import (
     finding,
 )
 from acsard.core.config.settings import Config
+from acsard.core.link.board_status import IDENTITY
 from acsard.core.link.checked_line import Reading
-from acsard.core.link.session import IDENTITY
 from tests.each import each
 from tests.unit.checkup_robots import MS, Checked, Robot
 

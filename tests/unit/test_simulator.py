@@ -359,3 +359,17 @@ def test_at_a_wrong_baud_rate_no_line_survives(sent: int, rx_rate: int) -> None:
     # stop bit in time. 0xff is one low bit. At 19200 it is a start bit, then a 0 and ones.
     assert garbled(b"\x00\xff", 9600, 19200)[:1] == b"\x00"
     assert garbled(b"\xff", 9600, 19200) == b"\xfe"
+
+
+def test_a_line_of_more_motors_is_refused_but_not_one_that_is_only_too_long() -> None:
+    assert plain_only(LINE, "ab") == prefix(LINE, "ab") == reference(LINE, "ab") is None
+    assert prefix(b"ap12.50,bn08.75,ap12.50,bn08.75\r\n", "ab") == BoardCommand({0: 12.5, 1: -8.75})
+
+
+def test_a_mute_board_does_not_answer_the_question_either() -> None:
+    mcu = FakeMcu(TRUE)
+    mcu.receive(0, b"?\r\n")
+    assert replies(mcu, 100 * MS)
+    with mcu.fault("mute"):
+        mcu.receive(100 * MS, b"?\r\n")
+        assert not replies(mcu, 200 * MS)

@@ -22,6 +22,8 @@ from acsard.core.values import NS_PER_S, Ns
 
 STATUS = b"!status"  # no other line begins like this
 
+IDENTITY = b"!acsard-mcu "  # acsard's firmware, after booting and as the answer to `?`
+
 # Time with the link up and without late steps, in which a board reports each field at least once.
 # Until then, a pressed emergency stop stays latched while its cable is plugged in again.
 FORGET_NS = 3 * NS_PER_S

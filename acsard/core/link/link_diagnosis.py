@@ -13,6 +13,7 @@ from msgspec.structs import replace
 
 from acsard.core.codes import CODES, Reason, joined, reason, sentence
 from acsard.core.formatting import many, printable_bytes
+from acsard.core.link.board_status import IDENTITY
 from acsard.core.link.codec import SPEED
 from acsard.core.link.link_setup import LinkSetup
 from acsard.core.link.link_state import Link, LinkState
@@ -98,6 +99,7 @@ class Traffic(Struct):
     good: int = 0
     statuses: int = 0
     texts: int = 0  # bad lines for which `is_text` holds
+    identified: bool = False  # acsard's firmware has named itself, here or in an interval before
     named: ReceivedCode | None = None  # by bad lines; that of a low supply stays
     formed: int = 0  # bad lines that are replies in another form
     lettered: int = 0  # bad lines that are replies of other motors
@@ -118,6 +120,7 @@ class Traffic(Struct):
         self.good += good
         if not good:
             self.last, self.within = line, bool(_RIGHT[len(letters)].search(line))
+            self.identified = self.identified or line.startswith(IDENTITY)
             self.texts += is_text(line)
             if self.named != "received_brownout":
                 self.named = named(line) or self.named
@@ -130,12 +133,14 @@ class Traffic(Struct):
 
     @property
     def code(self) -> ReceivedCode:
+        if self.named:
+            return self.named
+        if self.identified and not (self.good or self.formed or self.lettered):
+            return "received_identity"
         if self.statuses and not self.lines:
             return "received_statuses"
         if not self.size:
             return "received_nothing"
-        if self.named:
-            return self.named
         bad = self.lines - self.good
         if 2 * self.texts > bad:
             return "received_text"
@@ -152,6 +157,8 @@ class Traffic(Struct):
     @property
     def counted(self) -> str:
         """The number of lines, and the last bad one or the last bytes, as text."""
+        if self.identified and not self.lines:
+            return "only its name was received"
         if self.statuses and not self.lines:
             return "only status lines were received"
         if not self.size:
@@ -218,7 +225,7 @@ class SilenceDiagnosis(Struct):
         if now_ns - self.since_ns < FIRST_DIAGNOSIS_NS:
             return False
         before, self.complete = self.complete, self.now
-        self.now, self.since_ns = Traffic(), now_ns
+        self.now, self.since_ns = Traffic(identified=self.complete.identified), now_ns
         return before is None or before.code != self.complete.code
 
 

@@ -14,7 +14,7 @@ from msgspec import Struct, field
 from acsard.core.codes import Reason, sentence
 from acsard.core.formatting import printable_bytes
 from acsard.core.link import link_diagnosis
-from acsard.core.link.board_status import STATUS, StatusReports
+from acsard.core.link.board_status import IDENTITY, STATUS, StatusReports
 from acsard.core.link.checked_line import Reading, seal, unseal
 from acsard.core.link.codec import FrameError
 from acsard.core.link.echo_check import QUESTION, WINDOW_NS, EchoCheck
@@ -48,8 +48,6 @@ NAMES: dict[LinkState, EventName] = {
 
 # Without a line from the board or to the port, the MCU may have been reset: a new session begins.
 LONG_GAP_NS = 1 * NS_PER_S
-
-IDENTITY = b"!acsard-mcu "  # acsard's firmware, after booting and as the answer to `QUESTION`
 
 # Boot texts that say that the board has restarted, and why.
 RESTARTS: dict[str | None, str] = {
@@ -387,10 +385,13 @@ class McuSession(Struct):
         if line == QUESTION:
             self._reject("echo")
             self._echo.returned(at_ns)
-        elif not line.startswith(IDENTITY):
+            return
+        if not line.startswith(IDENTITY):
             self._reject("malformed", line)
             self._link.bad(setup.checked)
-        elif not self._echo.named(at_ns):
+            return
+        self._silence.now.identified = self._link.state != "up"
+        if not self._echo.named(at_ns):
             self._restart(
                 out, f"has restarted and sent its start line: {line.decode('ascii', 'replace')}"
             )

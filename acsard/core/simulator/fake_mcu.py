@@ -268,7 +268,7 @@ class FakeMcu:
 
     def _send_identity(self, now_ns: Ns) -> None:
         switches = self.switches
-        if switches.firmware == "reference":
+        if switches.firmware == "reference" and not switches.muted:
             self._send(
                 now_ns,
                 protocol.identity(self._counts, switches.watchdog_ns // MS, switches.samples),

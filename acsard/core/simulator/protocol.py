@@ -50,8 +50,13 @@ def plain_only(line: bytes, letters: str) -> BoardCommand | None:
 
 
 def prefix(line: bytes, letters: str) -> BoardCommand | None:
-    """Decode a line and ignore all after the speeds, as some firmware does, or return None."""
-    return _plain(line[: VALUE_LENGTH * len(letters) - 1], letters)
+    """Decode a line and ignore all after the speeds, as some firmware does, or return None.
+
+    A line that goes on with the speed of another motor is of a robot with more motors, not valid.
+    """
+    end = VALUE_LENGTH * len(letters) - 1
+    other = re.match(rb",([a-z])[pn]", line[end:])
+    return None if other and other[1].decode() not in letters else _plain(line[:end], letters)
 
 
 def latched(line: bytes, letters: str) -> BoardCommand:

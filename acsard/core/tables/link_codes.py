@@ -6,13 +6,14 @@ from typing import Literal
 
 from acsard.core.tables.finding_table import table
 
-# Bytes without a link. statuses: only status lines. text, form: most bad lines are text, or replies
-# in another form. cut: pieces of valid lines, or no line ends. foreign: valid lines within other
-# bytes. garbage: nothing like a line. few: good lines, and bad ones. sparse: too few lines.
+# Bytes without a link. identity: acsard's firmware has named itself, and sends no replies.
+# statuses: only status lines. text, form: most bad lines are text, or replies in another form. cut:
+# pieces of valid lines, or no line ends. foreign: valid lines within other bytes. garbage: nothing
+# like a line. few: good lines, and bad ones. sparse: too few lines.
 ReceivedCode = Literal[
     "received_nothing", "received_statuses", "received_text", "received_form", "received_letters",
     "received_cut", "received_foreign", "received_garbage", "received_few", "received_sparse",
-    "received_brownout", "received_boot", "received_nmea",
+    "received_brownout", "received_boot", "received_nmea", "received_identity",
 ]  # fmt: skip
 
 # States of the link.
@@ -129,6 +130,11 @@ FAIL received_boot | the board starts again and again
 FAIL received_nmea | another device
     no link to the microcontroller: {received}; this is what a GPS receiver sends;
     -> write the port of the board into mcu.port: `acsard ports` lists all
+FAIL received_identity | a name, but no replies
+    no link to the microcontroller: {received};
+    -> acsard's firmware is there, but answers no line. Does mcu.wheels name as many motors as it
+    has (the sketch of a Nano, an Uno, an ESP32 or a Pico has two: right = "+a", left = "+b"), is TX
+    of this computer connected to RX of the board{firmware}?
 FAIL received_few | few good lines
     no link to the microcontroller: {received};
     -> use a short cable away from the motors' leads, a common ground, or a lower baud rate at both
