@@ -11,6 +11,7 @@ run, and so does a code of `SLOW` or `ELSEWHERE` that was found.
 
 from __future__ import annotations
 
+import os
 import sys
 from collections.abc import Callable
 from typing import Any
@@ -30,12 +31,12 @@ SEEN: set[str] = set()
 
 # Only slow and nightly tests make the product find these, most of them those of `acsard mcu check`.
 SLOW = {
-    "baud_rate_other", "checked_link_missing", "damaged_lines_inverted", "damaged_lines_lenient",
+    "baud_rate_other", "checked_link_missing",
     "encoder_counts_damaged", "encoder_counts_wrong", "gyro_dead", "gyro_silent", "lost_lines_both",
     "lost_lines_late", "lost_lines_silent", "measured_speeds_set_points", "motor_dead_turns",
     "motor_last_edge", "motor_other_motor", "motor_reversed_encoder", "motor_reversed_motor",
     "port_trouble", "replies_echo", "replies_set_points", "reply_form_only_text_between",
-    "reply_form_text", "reply_rate_lossy", "watchdog_late",
+    "reply_form_text", "reply_rate_lossy",
 }  # fmt: skip
 
 # No test of `tests/unit` and `tests/scenarios` is known to make the product find these. Real
@@ -126,7 +127,10 @@ def pytest_testnodedown(node: Any) -> None:
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_sessionfinish(session: pytest.Session) -> None:
-    """Fail a usual run of all tests after which a list of codes is wrong."""
+    """Fail a usual run of all tests of a change (`CI`) after which a list of codes is wrong.
+
+    Elsewhere it is only printed: a test that is skipped there may be the one that finds a code.
+    """
     if (worker := getattr(session.config, "workeroutput", None)) is not None:
         worker["codes"] = sorted(SEEN)
         return
@@ -142,4 +146,5 @@ def pytest_sessionfinish(session: pytest.Session) -> None:
     ):
         if codes:
             print(f"\n{problem}: {sorted(codes)}")
-    session.exitstatus = pytest.ExitCode.TESTS_FAILED
+    if os.environ.get("CI"):
+        session.exitstatus = pytest.ExitCode.TESTS_FAILED

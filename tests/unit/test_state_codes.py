@@ -10,6 +10,7 @@ from functools import cache
 from pathlib import Path
 from typing import cast, get_args
 
+import pytest
 from msgspec.structs import replace
 
 import acsard
@@ -77,6 +78,7 @@ def test_every_text_and_every_advice_is_a_sentence() -> None:
     assert not CODES.keys() & OUTCOMES_BY_CODE.keys()
 
 
+@pytest.mark.slow
 def test_every_call_names_a_code_and_gives_the_values_of_its_texts() -> None:
     calls = 0
     for node in nodes():
