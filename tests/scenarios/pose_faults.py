@@ -56,10 +56,15 @@ class Case(Struct, frozen=True):
     gyro: bool = False
     counts: int = 3200
     checked: bool = False
+    silence: float = 0.0
+    """In each second, s; the daemon stalls in it, unless the board is `mute`."""
+    mute: bool = False
 
     @property
     def name(self) -> str:
         sensors = f"{self.counts} counts" + ", gyro" * self.gyro + ", checked" * self.checked
+        if self.silence:
+            sensors += f", {'mute' if self.mute else 'stalled'} {self.silence} s"
         return (
             f"{len(self.wheels.names)} wheels, {sensors}: {self.fault}, {self.which}, {self.drive}"
         )
@@ -92,6 +97,13 @@ def cases() -> Iterator[Case]:
                 groups = [one, "left", "all"] if len(names) == 4 else [one, "all"]
             for which in groups:
                 yield Case(fault, which, drive, wheels, gyro)
+    silences = product(MAPS, DRIVES, ENCODERS, (0.15, 0.3, 0.6), (False, True), (False, True))
+    for wheels, drive, fault, silence, mute, checked in silences:
+        for which in ("left", "all"):
+            yield Case(
+                fault, which, drive, wheels, checked=checked, silence=silence, mute=mute,
+                counts=3200 if silence > 0.2 else 48,
+            )  # fmt: skip
 
 
 def motors(case: Case) -> list[int]:
@@ -140,12 +152,13 @@ def begin(world: World, case: Case, stack: ExitStack) -> None:
 
 
 def run(case: Case) -> Result:
-    mcu = McuConfig(
+    settings = McuConfig(
         wheels=case.wheels, encoder_counts=case.counts, link_check="on" if case.checked else "off"
     )
     odometry = replace(CALIBRATED, gyro=case.gyro)
-    config = Config(mcu=mcu, odometry=odometry, sim=SimConfig(encoder_counts=case.counts))
+    config = Config(mcu=settings, odometry=odometry, sim=SimConfig(encoder_counts=case.counts))
     world = World(config, gyro=ImperfectGyro(bias=0.01, noise=0.005) if case.gyro else None)
+    mcu = world.mcu
     world.run(1.5)
     world.drive(0.2, 0.3, 0.5)
     steps = DRIVES[case.drive]
@@ -168,6 +181,11 @@ def run(case: Case) -> Result:
             if second == LEAD_S:
                 begin(world, case, stack)
             speed = steps[second % len(steps)]
+            if case.mute:
+                with mcu.fault("mute"):
+                    world.hold(*speed, seconds=case.silence)
+            elif case.silence:
+                world.stall(case.silence)
             for _ in range(10):
                 world.hold(*speed, seconds=0.1)
                 if second >= LEAD_S:

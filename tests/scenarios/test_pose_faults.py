@@ -18,6 +18,8 @@ SOME = [
     Case("dead motor", "rear_right", "on the spot"), Case("a fifth too slow", "all", "slalom", TWO),
     Case("swapped motors", "front_right front_left", "turning"),
     Case("twice", "all", "turning", TWO, gyro=True),
+    Case("a fifth too fast", "all", "straight", TWO, checked=True, silence=0.6),
+    Case("half", "left", "to and fro", checked=True, silence=0.3, mute=True),
 ]  # fmt: skip
 
 

@@ -17,7 +17,7 @@ from msgspec import Struct, field
 
 from acsard.core.link.feedback import MAX_FILLED_GAP_S, Line
 from acsard.core.motion.consistency import ConsistencyChecks
-from acsard.core.motion.doubts import Doubts
+from acsard.core.motion.doubts import SILENT, Doubts
 from acsard.core.motion.gaps import AT_REST, LONG_S, Rolled, Skipped, plus, rolled_over, times
 from acsard.core.motion.gyro import REST_S
 from acsard.core.motion.kinematics import on_arc
@@ -184,9 +184,11 @@ class Odometry(Struct):
                 distance, angle = model.kinematics.moved(found.astray)
                 uncertainty.miss("way", distance, 0.0, heading)
                 uncertainty.miss("turn", 0.0, turns * angle, heading)
-            for side, angles in found.wheels:
+            for side, lies in found.settled:
+                uncertainty.settle(SILENT[side], side if lies else None)
+            for cause, angles in found.of_sides:
                 distance, angle = model.kinematics.moved(angles)
-                uncertainty.miss(side, distance, turns * angle, heading)
+                uncertainty.miss(cause, distance, turns * angle, heading)
         return Estimate(
             line.at, self.pose, self.twist, uncertainty.covariance, uncertainty.twist,
             self.positions, speeds, line.asked_ns, line.heard_ns,

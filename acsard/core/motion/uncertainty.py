@@ -70,11 +70,12 @@ NO_EFFECT: Effect = (0.0, 0.0, 0.0, 0.0)
 
 # Causes of an error that do not average out. The motion that the pose may have missed is that of
 # gaps, and the differences of gyro and wheels, of the wheels and their commands (`way` and `turn`),
-# and of the wheels of a side.
-Missed = Literal["gap", "gyro", "way", "turn", "left", "right"]
+# of the wheels of a side, or of a side in silences, which may be taken back.
+Missed = Literal["gap", "gyro", "way", "turn", "left", "right", "silent left", "silent right"]
 RATIO, TRACK, SCALE, GYRO = PARAMETERS = range(4)
 MISSED: dict[Missed, int] = {cause: len(PARAMETERS) + i for i, cause in enumerate(get_args(Missed))}
 CAUSES = len(PARAMETERS) + len(MISSED)
+OPEN = MISSED["silent left"], MISSED["silent right"]
 
 
 class ErrorModel:
@@ -273,9 +274,11 @@ class Uncertainty(Struct):
 
     def _share_astray(self) -> float:
         # The root mean square of 1 - cos(e) for a normal error e of the heading; u is its mean.
-        variance = self.covariance.yawyaw
+        # What may be taken back is not in it.
+        open_yaws = [self.columns[k][2] for k in OPEN]
+        variance = self.covariance.yawyaw - sum([yaw * yaw for yaw in open_yaws])
         if variance <= MAX_HEADING_VARIANCE:
-            variance = sum([yaw * yaw for _, _, yaw in self.columns[len(PARAMETERS) :]])
+            variance = sum([yaw * yaw for _, _, yaw in self.columns[len(PARAMETERS) : OPEN[0]]])
         if not variance:
             return 0.0
         u = -math.expm1(-variance / 2)
@@ -301,6 +304,26 @@ class Uncertainty(Struct):
         self.bend.rolled += 2 * abs(distance)
         if self.bend.rolled > BEND_M:
             self._bend()
+        self._publish()
+
+    def settle(self, cause: Missed, other: Missed | None) -> None:
+        """Take a cause back: it missed nothing, or belongs to the `other` one."""
+        if (column := self.columns[MISSED[cause]]) == ORIGIN:
+            return
+        self._bend()
+        i, sums, columns = MISSED[cause], self.bend.of_causes, [*self.columns]
+        if other:
+            k = MISSED[other]
+            x, y, yaw = columns[k]
+            columns[k] = x + column[0], y + column[1], yaw + column[2]
+            for one, both in [(CAUSES * i + n, CAUSES * k + n) for n in range(CAUSES)] + [
+                (CAUSES * n + i, CAUSES * n + k) for n in range(CAUSES)
+            ]:
+                sums[both] = sums[both][0] + sums[one][0], sums[both][1] + sums[one][1]
+        for n in range(CAUSES):
+            sums[CAUSES * i + n] = sums[CAUSES * n + i] = 0.0, 0.0
+        columns[i] = ORIGIN
+        self.columns = self.bend.columns = columns
         self._publish()
 
     def set_twist(
