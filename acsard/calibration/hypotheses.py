@@ -18,7 +18,7 @@ from msgspec import Struct
 from msgspec.structs import replace
 
 from acsard.calibration.geometry import Base, path
-from acsard.calibration.log import Complexes, Floats, LogError, Mask, Run
+from acsard.calibration.log import MIXED, Complexes, Floats, LogError, Mask, Run
 from acsard.core.config.settings import DriveConfig
 from acsard.core.values import Seconds
 
@@ -290,6 +290,8 @@ def matched(sensor: str, runs: Sequence[Run], base: Base) -> Match:
 def _facts(runs: Sequence[Run], matches: Mapping[str, Match]) -> Iterator[str]:
     # Causes that the columns of the wheels show, if a sensor contradicts them.
     names = " and ".join(NAMES[sensor] for sensor in matches)
+    for mixed in {run.mixed for run in runs if run.mixed}:
+        yield MIXED.format(mixed)
     turns = sum(float(np.abs(np.diff(run.right - run.left)).sum()) for run in runs)
     if turns < TWICE * sum(_rolled(runs, side) for side in ("left", "right")):
         yield (
