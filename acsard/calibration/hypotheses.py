@@ -113,7 +113,7 @@ class Match(Struct, frozen=True):
     lever: tuple[float, float] = (0.0, 0.0)  # of the sensor, ahead and to the left, m
     bad: tuple[Span, ...] = ()
     row: str = ""  # a key of ROWS
-    as_given: float = 0.0  # share that the given row does not explain
+    as_given: float = 0.0  # unexplained share by the given row, with turns to the given side
 
     @property
     def follows(self) -> bool:
@@ -163,7 +163,7 @@ def examined(
         raise LogError(". ".join(causes))
     for sensor, match in matches.items():
         name = NAMES[sensor]
-        fact = f"{match.unexplained:.0%} of the motion by {name} is not that of the wheels"
+        fact = f"{percent(match.unexplained)} of the motion by {name} is not that of the wheels"
         if not following:
             if forward := _forward(runs):
                 raise LogError(f"{fact}, and {forward}")
@@ -284,7 +284,7 @@ def matched(sensor: str, runs: Sequence[Run], base: Base) -> Match:
             match = kind(sensor, list(map(ROWS[row], runs)), base).match(wide=True)
             found.append(replace(match, row=row))
         best = min(found, key=lambda match: match.cost)
-    return replace(best if best.follows else found[0], as_given=found[0].unexplained)
+    return replace(best if best.follows else found[0], as_given=found[0].as_given)
 
 
 def _facts(runs: Sequence[Run], matches: Mapping[str, Match]) -> Iterator[str]:
@@ -321,6 +321,10 @@ def _forward(runs: Sequence[Run]) -> str:
     return words if sides else ""
 
 
+def percent(share: float) -> str:
+    return f"{share:.0%}" if share >= 0.1 else f"{share:.1%}"
+
+
 def _rolled(runs: Sequence[Run], side: str) -> float:
     return sum(float(np.abs(np.diff(getattr(run, side))).sum()) for run in runs)
 
@@ -343,8 +347,8 @@ def _turned(matches: Mapping[str, Match]) -> Iterator[str]:
     names = " and ".join(NAMES[sensor] for sensor in odd)
     worst = max(odd.values(), key=lambda match: match.as_given)
     fact = (
-        f"the wheels miss {worst.as_given:.0%} of the motion by {names}, but only "
-        f"{worst.unexplained:.0%} if"
+        f"the wheels miss {percent(worst.as_given)} of the motion by {names}, but only "
+        f"{percent(worst.unexplained)} if"
     )
     rows = {match.row for match in odd.values()}
     if "angles" in rows:
@@ -545,7 +549,10 @@ class Turns(Comparison):
         off = np.where(known[at], off, np.minimum(moved[at], BAD_TURN))
         judged, bad = self.judged(self.begin, off, moved[at], self.moving, BAD_TURN)
         ratio = 1.0 if even else float(shares[at, 1] / (shares[at, 0] or 1e-9))
-        return Match(self.sensor, judged, track, delay, raw, ratio, bad=bad)
+        as_given = judged if track > 0.0 else 1.0
+        return Match(
+            self.sensor, judged, track, delay, raw, ratio, bad=bad, as_given=as_given
+        )  # fmt: skip
 
     def uneven(self) -> list[Match]:
         found = self.match(even=False)
@@ -626,7 +633,11 @@ class Places(Comparison):
         if not tracks.min() < track < tracks.max():
             share = max(share, FOLLOWS)  # the best track is none of a robot
         lever = float(ahead), float(aside)
-        return Match(self.sensor, share, track, delay, raw, ratio, float(size), lever, bad)
+        as_given = share if track > 0.0 else self.fitted(ratio, -track, delay)[0]
+        return Match(
+            self.sensor, share, track, delay, raw, ratio, float(size), lever, bad,
+            as_given=as_given,
+        )  # fmt: skip
 
     def uneven(self) -> list[Match]:
         return [self.match(ratio) for ratio in RATIOS]

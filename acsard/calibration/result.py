@@ -236,7 +236,7 @@ def _geometry(
         "The drives show the size of the wheels: distances are right to "
         f"{scale:.2%} (standard deviation)."
         if found.sized
-        else "A gyro does not show the size of the wheels, so distances are as right as "
+        else "Turns do not show the size of the wheels, so distances are as right as "
         "drive.wheel_radius: measure a straight run with a tape (--distance)."
     )
 
