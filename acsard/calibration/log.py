@@ -38,7 +38,7 @@ COLUMNS = {
 }  # fmt: skip
 
 MIN_ROWS, MIN_RUN_S = 8, 1.5
-MAX_STEP_S, MAX_SECONDS = 2.0, 6 * 3600.0  # between rows of the wheels, and of a log
+MAX_STEP_S, MAX_SECONDS = 1.5, 6 * 3600.0  # between rows of the wheels, and of a log
 BACK_S = 1.0  # a jump back of the time by which a new run begins
 GAP_S, GAP_PERIODS = 1.0, 8.0  # a gap of the wheels that ends a run: longer than both
 MAX_RUNS = 1000  # names in the column `run`
@@ -98,7 +98,8 @@ class Run(Struct, frozen=True):
     left: Floats  # angle that the left wheels have rolled, rad
     right: Floats
     gyro_t: Floats
-    turned: Floats  # integral of the gyro's rate, rad
+    rate: Floats  # of the gyro, rad/s
+    turned: Floats  # its integral, rad
     place_t: Floats
     place: Complexes  # x + iy, m
     yaw_t: Floats
@@ -192,8 +193,8 @@ def with_distance(log: Log, name: str, metres: Metres) -> Log:
         )
     none = np.zeros(0)
     measured = replace(
-        run, gyro_t=none, turned=none, place_t=none, place=none + 0j, yaw_t=none, yaw=none,
-        tape=(TapeReading("distance", metres, TAPE_STD_M),),
+        run, gyro_t=none, rate=none, turned=none, place_t=none, place=none + 0j, yaw_t=none,
+        yaw=none, tape=(TapeReading("distance", metres, TAPE_STD_M),),
     )  # fmt: skip
     return replace(log, runs=(*log.runs, measured))
 
@@ -468,11 +469,11 @@ def run_of(name: str, streams: Mapping[str, tuple[Floats, ...]], notes: Notes) -
     )
     start = t[0]
     run = Run(
-        name, t - start, integral(t, left), integral(t, right), gyro_t - start,
+        name, t - start, integral(t, left), integral(t, right), gyro_t - start, rate,
         integral(gyro_t, rate), place_t - start, x + 1j * y, yaw_t - start, yaw,
         commands[0] - start, np.column_stack(commands[1:]),
     )  # fmt: skip
-    run = _without_repeats(notes, _without_stuck(notes, run, rate))
+    run = _without_repeats(notes, _without_stuck(notes, run))
     for column, values in ("yaw_rate", rate), ("yaw", np.exp(1j * run.yaw)), ("x, y", run.place):
         if by_turns(values):
             raise LogError(MIXED.format(column))
@@ -488,8 +489,9 @@ def integral(t: Floats, values: Floats) -> Floats:
     return np.concatenate(([0.0], np.cumsum((values[1:] + values[:-1]) / 2 * np.diff(t))))
 
 
-def _without_stuck(notes: Notes, run: Run, rate: Floats) -> Run:
+def _without_stuck(notes: Notes, run: Run) -> Run:
     # Leave out a gyro that repeats one value to the last digit while the wheels' turn changes.
+    rate = run.rate
     if len(rate) < 2:
         return run
     begins = np.concatenate(([0], np.flatnonzero(np.diff(rate)) + 1))
@@ -506,7 +508,7 @@ def _without_stuck(notes: Notes, run: Run, rate: Floats) -> Run:
                 f"{run.gyro_t[end]:.0f} s of run {run.name or 1} ({end - begin + 1} samples), "
                 "although the turn of the wheels changes: the gyro hung, and this part is left out"
             )
-    return replace(run, gyro_t=run.gyro_t[kept], turned=run.turned[kept])
+    return replace(run, gyro_t=run.gyro_t[kept], rate=rate[kept], turned=run.turned[kept])
 
 
 def _without_repeats(notes: Notes, run: Run) -> Run:
