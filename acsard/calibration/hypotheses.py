@@ -18,7 +18,7 @@ from msgspec import Struct
 from msgspec.structs import replace
 
 from acsard.calibration.geometry import Base, path
-from acsard.calibration.log import Complexes, Floats, LogError, Mask, Run
+from acsard.calibration.log import MIXED, Complexes, Floats, LogError, Mask, Run
 from acsard.core.config.settings import DriveConfig
 from acsard.core.values import Seconds
 
@@ -53,6 +53,8 @@ MARGIN_S = 5.0  # beside a window that is left out
 LEAST_S, LEAST_PART_S = 30.0, 2.0  # of a log of which a part is left out, and of its parts
 STILL, ALONE = 1e-3, 0.2  # of a side that stands, rad in a step, and what the other rolls meanwhile
 TWICE, BACKWARDS = 0.02, 1e-3  # share of the rolled angle; rad in a row
+UNLIKE = 20.0  # ways of one side / of the other, that no robot drives
+OVERFLOWS, USUAL = 3.0, 0.9  # of this quantile of the steps of a running count
 
 # A gyro has two levels beside the wheels if this share of its rows is near one of them, this share
 # near the rarer one, and they are apart by so many of their spreads and this share of the larger.
@@ -62,7 +64,8 @@ FAST, STEADY = 0.3, 0.05  # share of the fast turns, which is compared; of a tur
 
 NAMES = {"gyro": "yaw_rate", "headings": "yaw", "positions": "x, y"}
 COLUMNS = {
-    "gyro": ("gyro_t", "turned"), "headings": ("yaw_t", "yaw"), "positions": ("place_t", "place"),
+    "gyro": ("gyro_t", "turned", "rate"), "headings": ("yaw_t", "yaw"),
+    "positions": ("place_t", "place"),
 }  # fmt: skip
 UNITS = "the speeds of the wheels are in {}, not in rad/s"
 COUNTS = "the speeds of the wheels are {} the true ones: correct the counts of a wheel turn"
@@ -89,10 +92,17 @@ MIRRORED = {
     "positions": "x, y are mirrored: y must point to the left of x",
 }  # fmt: skip
 
+
+def _unwrapped(integral: Floats, t: Floats) -> Floats:
+    steps = np.diff(np.gradient(integral, t), prepend=0.0)
+    wild = np.abs(steps) > OVERFLOWS * np.quantile(np.abs(steps), USUAL)
+    return np.asarray(np.cumsum(np.where(wild, 0.0, steps)))
+
+
 # Other meanings of the columns. If they are angles, the angle is what was integrated.
 ROWS: dict[str, Callable[[Run], Run]] = {
     "angles": lambda run: replace(
-        run, left=np.gradient(run.left, run.t), right=np.gradient(run.right, run.t)
+        run, left=_unwrapped(run.left, run.t), right=_unwrapped(run.right, run.t)
     ),
     "degrees": lambda run: replace(run, yaw=np.radians(run.yaw)),
 }
@@ -113,7 +123,7 @@ class Match(Struct, frozen=True):
     lever: tuple[float, float] = (0.0, 0.0)  # of the sensor, ahead and to the left, m
     bad: tuple[Span, ...] = ()
     row: str = ""  # a key of ROWS
-    as_given: float = 0.0  # share that the given row does not explain
+    as_given: float = 0.0  # unexplained share by the given row, with turns to the given side
 
     @property
     def follows(self) -> bool:
@@ -157,16 +167,16 @@ def examined(
     }  # fmt: skip
     if causes := [
         *_turned(following),
-        *_sized(following, drive, _forward(runs)),
+        *_sized(following, drive, forward(runs)),
         *_late(following),
     ]:
         raise LogError(". ".join(causes))
     for sensor, match in matches.items():
         name = NAMES[sensor]
-        fact = f"{match.unexplained:.0%} of the motion by {name} is not that of the wheels"
+        fact = f"{percent(match.unexplained)} of the motion by {name} is not that of the wheels"
         if not following:
-            if forward := _forward(runs):
-                raise LogError(f"{fact}, and {forward}")
+            if words := forward(runs):
+                raise LogError(f"{fact}, and {words}")
             raise LogError(
                 f"{fact}, and neither swapped sides nor signs, units or delays of up to "
                 f"{WIDE_DELAYS_S[-1]:.0f} s explain it. Is {name} of the same drive, with times "
@@ -185,7 +195,7 @@ def examined(
 
 
 def sensors(runs: Sequence[Run]) -> list[str]:
-    return [s for s, (t, _) in COLUMNS.items() if any(len(getattr(run, t)) > 2 for run in runs)]
+    return [s for s, (t, *_) in COLUMNS.items() if any(len(getattr(run, t)) > 2 for run in runs)]
 
 
 def without(run: Run, *left_out: str) -> Run:
@@ -196,12 +206,7 @@ def without(run: Run, *left_out: str) -> Run:
 
 def gyro_bias(runs: Sequence[Run]) -> tuple[float, float]:
     """Return the rate that the gyro shows while the wheels rest, and its deviation, rad/s."""
-    rates = [np.zeros(0)]
-    for run in runs:
-        if len(run.gyro_t) > 1:
-            t = (run.gyro_t[1:] + run.gyro_t[:-1]) / 2
-            rates.append((np.diff(run.turned) / np.diff(run.gyro_t))[run.rests(t)])
-    rest = np.concatenate(rates)
+    rest = np.concatenate([run.rate[run.rests(run.gyro_t)] for run in runs])
     known = len(rest) > MIN_RESTS
     return (float(np.median(rest)), REST_BIAS_STD) if known else (0.0, BIAS_STD)
 
@@ -210,10 +215,9 @@ def _alternates(runs: Sequence[Run], base: Base) -> str:
     # What a gyro that is now this, now that share of the wheels' turn shows: two sensors in blocks.
     found = [(np.zeros(0), np.zeros(0))]
     for run in runs:
-        t = (run.gyro_t[1:] + run.gyro_t[:-1]) / 2
         left, right = (np.gradient(side, run.t) for side in (run.left, run.right))
-        turn = np.interp(t, run.t, base.right * right - base.left * left) / base.track
-        found.append((turn, np.diff(run.turned) / np.maximum(np.diff(run.gyro_t), 1e-9)))
+        turn = np.interp(run.gyro_t, run.t, base.right * right - base.left * left) / base.track
+        found.append((turn, run.rate))
     turn, rate = (np.concatenate(columns) for columns in zip(*found, strict=True))
     size = np.abs(turn)
     usual = float(np.quantile(size, 0.9)) if len(size) else 0.0
@@ -284,12 +288,14 @@ def matched(sensor: str, runs: Sequence[Run], base: Base) -> Match:
             match = kind(sensor, list(map(ROWS[row], runs)), base).match(wide=True)
             found.append(replace(match, row=row))
         best = min(found, key=lambda match: match.cost)
-    return replace(best if best.follows else found[0], as_given=found[0].unexplained)
+    return replace(best if best.follows else found[0], as_given=found[0].as_given)
 
 
 def _facts(runs: Sequence[Run], matches: Mapping[str, Match]) -> Iterator[str]:
     # Causes that the columns of the wheels show, if a sensor contradicts them.
     names = " and ".join(NAMES[sensor] for sensor in matches)
+    for mixed in {run.mixed for run in runs if run.mixed}:
+        yield MIXED.format(mixed)
     turns = sum(float(np.abs(np.diff(run.right - run.left)).sum()) for run in runs)
     if turns < TWICE * sum(_rolled(runs, side) for side in ("left", "right")):
         yield (
@@ -302,12 +308,19 @@ def _facts(runs: Sequence[Run], matches: Mapping[str, Match]) -> Iterator[str]:
         if alone > ALONE * rolled:
             yield (
                 f"{side} stands still from {begin:.0f} to {end:.0f} s, while {other} rolls "
-                f"{alone:.0f} of its {rolled:.0f} rad, and {names} contradicts that: is its "
-                "encoder dead, or its cable loose?"
+                f"{alone:.0f} of its {rolled:.0f} rad, against {names}: is its encoder dead, or "
+                "its cable loose?"
             )
+    less, more = sorted(("left", "right"), key=lambda side: _rolled(runs, side))
+    if (ratio := _rolled(runs, more) / (_rolled(runs, less) + 1e-9)) > UNLIKE:
+        yield (
+            f"{more} rolls {ratio:.0f} times as far as {less}, against {names}: is {more} a "
+            "running count, or in another unit? Write both as speeds in rad/s"
+        )
 
 
-def _forward(runs: Sequence[Run]) -> str:
+def forward(runs: Sequence[Run]) -> str:
+    """Return a sentence about sides that never turn backwards, or nothing."""
     sides = [
         side for side in ("left", "right")
         if all(np.diff(getattr(run, side)).min() > -BACKWARDS for run in runs)
@@ -317,6 +330,10 @@ def _forward(runs: Sequence[Run]) -> str:
         "one channel, or a sign was lost: record speeds with their sign"
     )
     return words if sides else ""
+
+
+def percent(share: float) -> str:
+    return f"{share:.0%}" if share >= 0.1 else f"{share:.1%}"
 
 
 def _rolled(runs: Sequence[Run], side: str) -> float:
@@ -341,8 +358,8 @@ def _turned(matches: Mapping[str, Match]) -> Iterator[str]:
     names = " and ".join(NAMES[sensor] for sensor in odd)
     worst = max(odd.values(), key=lambda match: match.as_given)
     fact = (
-        f"the wheels miss {worst.as_given:.0%} of the motion by {names}, but only "
-        f"{worst.unexplained:.0%} if"
+        f"the wheels miss {percent(worst.as_given)} of the motion by {names}, but only "
+        f"{percent(worst.unexplained)} if"
     )
     rows = {match.row for match in odd.values()}
     if "angles" in rows:
@@ -543,7 +560,10 @@ class Turns(Comparison):
         off = np.where(known[at], off, np.minimum(moved[at], BAD_TURN))
         judged, bad = self.judged(self.begin, off, moved[at], self.moving, BAD_TURN)
         ratio = 1.0 if even else float(shares[at, 1] / (shares[at, 0] or 1e-9))
-        return Match(self.sensor, judged, track, delay, raw, ratio, bad=bad)
+        as_given = judged if track > 0.0 else 1.0
+        return Match(
+            self.sensor, judged, track, delay, raw, ratio, bad=bad, as_given=as_given
+        )  # fmt: skip
 
     def uneven(self) -> list[Match]:
         found = self.match(even=False)
@@ -624,7 +644,11 @@ class Places(Comparison):
         if not tracks.min() < track < tracks.max():
             share = max(share, FOLLOWS)  # the best track is none of a robot
         lever = float(ahead), float(aside)
-        return Match(self.sensor, share, track, delay, raw, ratio, float(size), lever, bad)
+        as_given = share if track > 0.0 else self.fitted(ratio, -track, delay)[0]
+        return Match(
+            self.sensor, share, track, delay, raw, ratio, float(size), lever, bad,
+            as_given=as_given,
+        )  # fmt: skip
 
     def uneven(self) -> list[Match]:
         return [self.match(ratio) for ratio in RATIOS]

@@ -38,7 +38,7 @@ COLUMNS = {
 }  # fmt: skip
 
 MIN_ROWS, MIN_RUN_S = 8, 1.5
-MAX_STEP_S, MAX_SECONDS = 2.0, 6 * 3600.0  # between rows of the wheels, and of a log
+MAX_STEP_S, MAX_SECONDS = 1.5, 6 * 3600.0  # between rows of the wheels, and of a log
 BACK_S = 1.0  # a jump back of the time by which a new run begins
 GAP_S, GAP_PERIODS = 1.0, 8.0  # a gap of the wheels that ends a run: longer than both
 MAX_RUNS = 1000  # names in the column `run`
@@ -47,12 +47,15 @@ STANDSTILL_SPEED = 0.02  # rad/s, up to which a wheel stands
 REST_S = 0.4  # over which the wheels must hardly roll: an encoder at rest may rock between counts
 REST_ROLL = 0.03  # rad
 
-# A value stands apart if a jump leads to it and the next jump leads back. Single ones are wrong; if
-# there are many, two programs write one column.
-BACK, NOISES, STAY_S = 0.2, 12.0, 0.1  # of the jump; of the quartile of the differences; until back
-NEAR_SHARE, FAR_SHARES = 0.1, 3.0  # of the range of the values
-FAR_STEPS = 5.0  # of the usual step of positions
-MAX_APART, STEPS = 0.2, 1.5  # share of the moving values; steps of a coarse encoder
+BACK, NOISES = 0.2, 12.0  # of the jump to a wrong value; of the quartile of all jumps
+FAR_SHARES, FAR_STEPS = 3.0, 5.0  # of the range of the values; of the usual step of positions
+
+# Of 6,720 simulated sides (16 to 3,200 counts, 10 to 100 Hz), 5 look like two series by these, and
+# none together with the other side. Of two series in one side, 6 in 10 are found.
+CYCLE_ROWS, CYCLES, MIN_BLOCKS = range(2, 8), 6, 3  # rows of a cycle; cycles of a block; blocks
+MOVING, STILL, OTHER_SHARE = 0.3, 0.002, 0.15  # of the usual speed, twice; of the present speed
+STEPS, SURE = 1.2, 4.0  # jumps at slow speeds; standard deviations of the mean
+MAX_OTHER, MIN_MOVING = 0.3, 5  # share of the blocks that move; and so many of them
 
 STUCK_S, STUCK_TURN = 1.0, 0.3  # a gyro that repeats one value while the wheels' turn changes, rad
 
@@ -63,6 +66,11 @@ STRAIGHT, MIN_STRAIGHT = 0.9, 5.0  # share of the rolled angle, and this angle, 
 
 MAX_SIDE_DIFFERENCE = 0.15  # of front and rear wheel, as a share of the rolled angle
 
+MIXED = (
+    "in {}, two series of values alternate: the values jump to and fro, as if two programs or "
+    "sensors wrote them (a joint_state_publisher beside the driver, or two IMUs on one topic). "
+    "Record only one of them"
+)
 ADVICE = (
     "write a CSV file with commas, decimal points and SI units, whose first line names the columns "
     'like "t,left,right,yaw_rate" or "t,fr,fl,rl,rr,x,y" (page reference/csv of the manual explains'
@@ -90,13 +98,15 @@ class Run(Struct, frozen=True):
     left: Floats  # angle that the left wheels have rolled, rad
     right: Floats
     gyro_t: Floats
-    turned: Floats  # integral of the gyro's rate, rad
+    rate: Floats  # of the gyro, rad/s
+    turned: Floats  # its integral, rad
     place_t: Floats
     place: Complexes  # x + iy, m
     yaw_t: Floats
     yaw: Floats  # may be wrapped, rad
     commands_t: Floats
     commands: Floats  # m/s and rad/s, shape (n, 2)
+    mixed: str = ""  # columns of the wheels that may be two series, or coarse
     tape: tuple[TapeReading, ...] = ()
 
     @property
@@ -183,8 +193,8 @@ def with_distance(log: Log, name: str, metres: Metres) -> Log:
         )
     none = np.zeros(0)
     measured = replace(
-        run, gyro_t=none, turned=none, place_t=none, place=none + 0j, yaw_t=none, yaw=none,
-        tape=(TapeReading("distance", metres, TAPE_STD_M),),
+        run, gyro_t=none, rate=none, turned=none, place_t=none, place=none + 0j, yaw_t=none,
+        yaw=none, tape=(TapeReading("distance", metres, TAPE_STD_M),),
     )  # fmt: skip
     return replace(log, runs=(*log.runs, measured))
 
@@ -203,10 +213,15 @@ def read(data: bytes) -> Log:
         columns = table.columns
         for name in [name for name in (*FOUR, *TWO, "yaw_rate") if name in columns]:
             rows = np.flatnonzero(np.isfinite(columns[name]))
-            wild = rows[apart(name, columns["t"][rows], columns[name][rows])]
+            wild = rows[apart(columns[name][rows])]
             table.notes.add(f"cells of {name} left out, far from those beside them, such as "
                        f"{columns[name][wild[:1]].sum():g}: {{}}", len(wild))  # fmt: skip
             columns[name][wild] = math.nan
+        wheels = [name for name in (*FOUR, *TWO) if name in columns]
+        whole = np.isfinite([columns[name] for name in wheels]).all(axis=0)
+        mixed = [name for name in wheels if by_turns(columns[name][whole])]
+        if mixed and by_turns(*(columns[name][whole] for name in wheels)):
+            raise LogError(MIXED.format(" and ".join(wheels)))
         columns["left"], columns["right"] = _sides(table)
         runs = []
         for number, name in enumerate(table.names):
@@ -228,7 +243,10 @@ def read(data: bytes) -> Log:
     seconds = sum(run.seconds for run in runs)
     if seconds > MAX_SECONDS:
         raise LogError(f"the drive lasts {seconds / 3600:.0f} h: is t in s, and not in ms?")
-    named = tuple(run if run.name else replace(run, name=str(at)) for at, run in enumerate(runs, 1))
+    named = tuple(
+        replace(run, name=run.name or str(at), mixed=" and ".join(mixed))
+        for at, run in enumerate(runs, 1)
+    )
     return Log(named, table.notes.sentences())
 
 
@@ -301,34 +319,58 @@ def _used(header: Sequence[str]) -> list[str]:
     return used
 
 
-def apart(name: str, t: Floats, values: Floats | Complexes) -> Mask:
-    """Return a mask of single values that are wrong. Raise `LogError` if two series alternate."""
+def apart(values: Floats | Complexes) -> Mask:
+    """Return a mask of single values that are wrong: a jump leads there, and the next one back."""
     mask = np.zeros(len(values), dtype=bool)
     if len(values) < MIN_ROWS:
         return mask
-    places = np.iscomplexobj(values)
-    sizes = np.abs(values - (np.mean(values) if places else 0.0))
-    usual, jumps = float(np.quantile(sizes, 0.95)), np.abs(np.diff(values))
-    # Of two series that alternate, every second or fourth value is of the same one.
-    noise = min(np.quantile(np.abs(values[k:] - values[:-k]), 0.25) for k in range(1, 5))
-    # A coarse encoder alternates between multiples of its step.
-    step = float(np.quantile(np.abs(values[values != 0]), 0.02)) if values.any() else 0.0
-    far = max(NOISES * float(noise), 0.0 if places else max(NEAR_SHARE * usual, STEPS * step))
-    undone = np.zeros((max(1, round(STAY_S / max(1e-3, float(np.median(np.diff(t)))))), len(jumps)),
-                      dtype=bool)  # fmt: skip
-    for k, row in enumerate(undone[:, : len(jumps) - 1], 1):
-        back = np.abs(values[1 + k :] - values[: -1 - k]) < BACK * jumps[:-k]
-        row[: len(back)] = back & (np.minimum(jumps[:-k], jumps[k:]) > far)
-    moving = (np.maximum(sizes[1:], sizes[:-1]) > far) | places
-    if undone.any(axis=0).sum() > MAX_APART * max(moving.sum(), 5 * MIN_ROWS):
-        raise LogError(
-            f"in {name}, two series of values alternate: the values jump to and fro, as if two "
-            "programs or sensors wrote them (a joint_state_publisher beside the driver, or two "
-            "IMUs on one topic). Record only one of them"
-        )
-    least = FAR_STEPS * float(np.median(jumps)) if places else FAR_SHARES * usual
-    mask[1:-1] = undone[0, :-1] & (jumps[:-1] > least)
+    jumps = np.abs(np.diff(values))
+    least = (
+        max(NOISES * float(np.quantile(jumps, 0.25)), FAR_STEPS * float(np.median(jumps)))
+        if np.iscomplexobj(values)
+        else FAR_SHARES * float(np.quantile(np.abs(values), 0.95))
+    )
+    mask[1:-1] = np.minimum(jumps[1:], jumps[:-1]) > least
+    mask[1:-1] &= np.abs(values[2:] - values[:-2]) < BACK * jumps[:-1]
     return mask
+
+
+def by_turns(*columns: Floats | Complexes) -> bool:
+    """Return whether in the same rows of a short cycle, all columns have values of another series.
+
+    A coarse encoder jumps to and fro by the same step at any speed. Of two series, the difference
+    grows with the speed. Rates are real; positions and directions are complex.
+    """
+    values = np.array(columns)
+    places, size = np.iscomplexobj(values), np.abs(values)
+    usual = np.quantile(size, 0.95, axis=1)[:, None] if size.size else size
+    for period in CYCLE_ROWS:
+        half, count = period // 2, (values.shape[1] - period) // (period * CYCLES)
+        if count < MIN_BLOCKS:
+            break
+        kernel = np.full(2 * half + 1, 1 / period)
+        kernel[[0, -1]] *= 1.0 if period % 2 else 0.5
+        smooth = np.array([np.convolve(column, kernel, "same") for column in values])
+        off, sizes = (
+            v[:, half : half + count * period * CYCLES].reshape(-1, count, CYCLES, period)
+            for v in (values - smooth, size)
+        )
+        mean, speed = off.mean(axis=2), sizes.mean(axis=(2, 3))
+        least = np.median(np.abs(values[:, period:] - values[:, :-period]), axis=1)[:, None]
+        moves = np.full(speed.shape, places)
+        if not places:
+            moves = speed > MOVING * usual
+            slow = ~moves & (speed > STILL * usual)
+            jumps = np.abs(off).max(axis=(2, 3))
+            step = [np.median(j[s]) if s.sum() > 1 else u / 2
+                    for j, s, u in zip(jumps, slow, usual[:, 0], strict=True)]  # fmt: skip
+            least = np.maximum(OTHER_SHARE * speed, STEPS * np.array(step)[:, None])
+        spread = np.sqrt((np.abs(off - mean[:, :, None]) ** 2).mean(axis=2) / CYCLES)
+        other = np.abs(mean) > np.maximum(SURE * spread, least[:, :, None])
+        blocks = (other & moves[:, :, None]).all(axis=0).any(axis=1).sum()
+        if blocks > MAX_OTHER * max(MIN_MOVING, moves.all(axis=0).sum()):
+            return True
+    return False
 
 
 def _sides(table: _Table) -> tuple[Floats, Floats]:
@@ -427,16 +469,17 @@ def run_of(name: str, streams: Mapping[str, tuple[Floats, ...]], notes: Notes) -
     )
     start = t[0]
     run = Run(
-        name, t - start, integral(t, left), integral(t, right), gyro_t - start,
+        name, t - start, integral(t, left), integral(t, right), gyro_t - start, rate,
         integral(gyro_t, rate), place_t - start, x + 1j * y, yaw_t - start, yaw,
         commands[0] - start, np.column_stack(commands[1:]),
     )  # fmt: skip
-    apart("yaw_rate", gyro_t, rate)
-    apart("yaw", yaw_t, np.exp(1j * yaw))
-    wild = apart("x, y", place_t, run.place)
+    run = _without_repeats(notes, _without_stuck(notes, run))
+    for column, values in ("yaw_rate", rate), ("yaw", np.exp(1j * run.yaw)), ("x, y", run.place):
+        if by_turns(values):
+            raise LogError(MIXED.format(column))
+    wild = apart(run.place)
     notes.add("rows of x, y left out, far from those beside them: {}", int(wild.sum()))
-    run = replace(run, place_t=run.place_t[~wild], place=run.place[~wild])
-    return _without_repeats(notes, _without_stuck(notes, run, rate))
+    return replace(run, place_t=run.place_t[~wild], place=run.place[~wild])
 
 
 def integral(t: Floats, values: Floats) -> Floats:
@@ -446,8 +489,9 @@ def integral(t: Floats, values: Floats) -> Floats:
     return np.concatenate(([0.0], np.cumsum((values[1:] + values[:-1]) / 2 * np.diff(t))))
 
 
-def _without_stuck(notes: Notes, run: Run, rate: Floats) -> Run:
+def _without_stuck(notes: Notes, run: Run) -> Run:
     # Leave out a gyro that repeats one value to the last digit while the wheels' turn changes.
+    rate = run.rate
     if len(rate) < 2:
         return run
     begins = np.concatenate(([0], np.flatnonzero(np.diff(rate)) + 1))
@@ -464,7 +508,7 @@ def _without_stuck(notes: Notes, run: Run, rate: Floats) -> Run:
                 f"{run.gyro_t[end]:.0f} s of run {run.name or 1} ({end - begin + 1} samples), "
                 "although the turn of the wheels changes: the gyro hung, and this part is left out"
             )
-    return replace(run, gyro_t=run.gyro_t[kept], turned=run.turned[kept])
+    return replace(run, gyro_t=run.gyro_t[kept], rate=rate[kept], turned=run.turned[kept])
 
 
 def _without_repeats(notes: Notes, run: Run) -> Run:

@@ -15,7 +15,7 @@ from rich.console import RenderableType
 
 from acsard.calibration.fit import AGREES, Errors, Fit, fit
 from acsard.calibration.geometry import LEFT, RIGHT, TRACK
-from acsard.calibration.hypotheses import NAMES, Match, examined, without
+from acsard.calibration.hypotheses import NAMES, Match, examined, forward, without
 from acsard.calibration.log import Floats, Log, LogError, Run, TapeReading
 from acsard.calibration.noise import Noise, noise
 from acsard.calibration.response import response_time
@@ -88,7 +88,7 @@ def calibrate(log: Log, config: Config, source: str) -> Result:
         if not found.tracked:
             raise LogError(
                 f"{' and '.join(found.sensors)} show no track, because others fit them as well: "
-                "drive on after each turn on the spot, and drive curves"
+                + (forward(runs) or "drive on after each turn on the spot, and drive curves")
             )
         log = Log(log.runs, (*_too_good(found), *log.notes))
         return _require_drive(_result(log, config, source, found))
@@ -236,7 +236,7 @@ def _geometry(
         "The drives show the size of the wheels: distances are right to "
         f"{scale:.2%} (standard deviation)."
         if found.sized
-        else "A gyro does not show the size of the wheels, so distances are as right as "
+        else "Turns do not show the size of the wheels, so distances are as right as "
         "drive.wheel_radius: measure a straight run with a tape (--distance)."
     )
 

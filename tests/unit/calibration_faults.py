@@ -38,6 +38,31 @@ def sound(
     return rows
 
 
+def coarse(
+    counts: int, hz: int, names: tuple[str, ...], wheels: tuple[str, ...] = ("left", "right"),
+    drive: Columns = DRIVE, filtered: float = 1.0,
+) -> Columns:  # fmt: skip
+    """Return a drive whose board counts edges, and samples them within a tenth of its period.
+
+    It may filter its speeds: a new one counts by a share.
+    """
+    rng, step = np.random.default_rng(counts + hz), 2 * np.pi / counts
+    t = np.arange(0.0, float(drive["t"][-1]), 1 / hz)
+    at = np.sort(t + rng.normal(0, 0.1 / hz, len(t)))
+    rows = {"t": (t[1:] + t[:-1]) / 2}
+    for name in wheels:
+        side = "left" if name in ("left", "fl", "rl") else "right"
+        angle = np.interp(at, drive["t"], drive[f"{side}_angle"]) + rng.uniform(0, step)
+        rows[name] = np.diff(np.floor(angle / step) * step) * hz
+        for n in range(1, len(rows[name]) if filtered < 1.0 else 0):
+            rows[name][n] = (1 - filtered) * rows[name][n - 1] + filtered * rows[name][n]
+    return rows | {
+        name: np.interp(rows["t"], drive["t"], drive["w" if name == "yaw_rate" else name])
+        + rng.normal(0, NOISE[name], len(t) - 1)
+        for name in names
+    }  # fmt: skip
+
+
 def csv(rows: Columns) -> bytes:
     cells = [[f"{v:.4f}" if np.isfinite(v) else "" for v in column] for column in rows.values()]
     lines = zip(*cells, strict=True)

@@ -15,7 +15,7 @@ from msgspec import structs
 from acsard.calibration.fit import AHEAD, ASIDE, BIAS, GYRO_DELAY, POSE_DELAY, Fit, Piece, fit
 from acsard.calibration.geometry import LEFT, RIGHT, TRACK, Base
 from acsard.calibration.log import LogError, TapeReading
-from acsard.core.config.settings import Config
+from acsard.core.config.settings import Config, OdometryConfig
 from tests.unit.calibration_logs import (
     IDEAL,
     WAYS,
@@ -78,13 +78,14 @@ def test_a_perfect_robot_is_found_exactly(way: str) -> None:
     assert not places or left == pytest.approx(0.998, abs=3e-4)
 
 
+GOOD_GYRO = Config(odometry=OdometryConfig(gyro_scale_std=0.004))
 SETS = {"constant track": (1.5, 0.02), "no skidding": (1.0, 0.003), "manoeuvres": (1.9, 0.05)}
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", SETS)
 def test_standard_deviations_are_as_wide_as_the_errors(kind: str) -> None:
-    """The gyro has a scale error of 0.4 %, which is part of the track's deviation."""
+    """The gyro has a scale error of 0.4 %, which is configured: part of the track's deviation."""
     chi, slip = SETS[kind]
     tracks, ratios = [], []
     for seed in range(20):
@@ -96,7 +97,7 @@ def test_standard_deviations_are_as_wide_as_the_errors(kind: str) -> None:
             drive(robot, wander(rng, 8.0 if short else 90.0)) for _ in range(12 if short else 1)
         ]
         drives = [replace(trip, gyro=trip.gyro * scale) for trip in drives]
-        found = fitted(*drives, places=False)
+        found = fitted(*drives, places=False, config=GOOD_GYRO)
         track, left, right = np.log(multipliers(found))
         tracks.append((track - (left + right) / 2 - np.log(chi)) / found.shares[0])
         ratios.append((right - left - np.log(1.01 / 0.99)) / found.shares[1])
@@ -225,6 +226,14 @@ def test_a_gyro_that_is_late_biased_and_interrupted_gives_the_same_track() -> No
 def test_positions_that_are_late_give_the_same_track() -> None:
     trips = [drive(Robot(late=late, rng=np.random.default_rng(3)), GUIDED) for late in (0.0, 0.3)]
     same_but_for_a_delay(*(fitted(trip, gyro=False) for trip in trips))
+
+
+def test_headings_alone_show_no_size_of_the_wheels() -> None:
+    trip, rng = usual(), np.random.default_rng(2)
+    noisy = replace(trip, yaw=trip.yaw + rng.normal(0.0, 0.004, len(trip.yaw)))
+    found = fit([by_headings(noisy, 0.0)], Config())
+    assert not found.sized
+    assert found.shares[2] > 0.012  # of both radii alike, as before the log
 
 
 def test_headings_that_are_late_give_the_same_track() -> None:

@@ -51,7 +51,7 @@ def test_a_longer_response_time_is_written_and_a_shorter_one_is_not(
     trip = run(usual(), places=False)
     slow = commanded(0.45)
     none = np.zeros(0)
-    slow = structs.replace(slow, gyro_t=none, turned=none)
+    slow = structs.replace(slow, gyro_t=none, rate=none, turned=none)
     config = structs.replace(Config(), feedback=FeedbackConfig(response_time=present))
     result = calibrate(Log((trip, slow), ()), config, "a.csv")
     assert ("feedback.response_time" in result.settings) == written
