@@ -181,6 +181,13 @@ class _CommandSpacing:
             self._next_s = max(self._next_s, self._last_s + MIN_SPACING_S)
 
 
+def accepted(reply: schema.ServiceReply) -> schema.ServiceReply:
+    """Return the reply. Raises `ReplyError` if it is a refusal: a program must not miss it."""
+    if not reply.success:
+        raise ReplyError(reply.message)
+    return reply
+
+
 class Connection(Reads):
     """The connection of a tool or a `Client` to one robot, with all keys."""
 

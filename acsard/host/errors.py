@@ -56,7 +56,7 @@ class NoAnswerError(MendableError, TimeoutError):
 
 
 class ReplyError(MendableError, RuntimeError):
-    """The daemon's reply says that the request failed, or the reply cannot be decoded."""
+    """The reply is a refusal or a failure, or it cannot be decoded."""
 
 
 class NotDrivenError(MendableError, RuntimeError):

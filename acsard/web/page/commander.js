@@ -147,8 +147,12 @@ export function twist(x, y, limit, limits) {
   const far = Math.hypot(x, y);
   if (far < 0.08) return [0, 0];
   const scale = far > 1 ? 1 / far : 1;
+  return [y * scale * limit, -x * scale * turning(limit, limits)];
+}
+
+/** Return the highest turn rate of the stick at a highest speed, rad/s. */
+export function turning(limit, limits) {
   // A robot that can only turn has a linear limit of 0.
   const share = limits.linear > 0 ? limit / limits.linear : 0;
-  const turn = Math.min(limits.angular, Math.max(0.4, limits.angular * share));
-  return [y * scale * limit, -x * scale * turn];
+  return Math.min(limits.angular, Math.max(0.4, limits.angular * share));
 }
