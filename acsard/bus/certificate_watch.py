@@ -16,9 +16,9 @@ from typing import NamedTuple
 from acsard.bus.tls_files import expiry_times, peer_ends_ns, unusable
 from acsard.bus.tls_trouble import RENEW_ADVICE
 from acsard.bus.zenoh_sessions import certificate_trouble
-from acsard.core.codes import Code
+from acsard.core.codes import Code, joined
 from acsard.core.config.settings import BusConfig
-from acsard.core.messages.certificate_expiry import expiry, short_code, urgency
+from acsard.core.messages.certificate_expiry import expiry, urgency
 from acsard.core.values import NS_PER_S, Event, WallNs
 from acsard.host import clock
 from acsard.host.threads import NoThreadError, in_thread
@@ -131,6 +131,5 @@ def _tell_of_change(
     why = expiry(known, now_ns, RENEW_ADVICE)
     now = _Said(why.code, urgency(known, now_ns))
     if now != said and why.level != "ok":
-        text = f"{why.text}; {why.advice}"
-        tell(Event("certificate", text, "warning", kind=short_code(why), code=why.code))
+        tell(Event("certificate", joined(why).text, "warning", code=why.code))
     return now

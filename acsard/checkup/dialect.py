@@ -58,9 +58,7 @@ def baud(board: Board) -> Finding:
     # The daemon says the same about bytes that are no good lines.
     why = data.reason(f"at {configured} baud {{}}; no good line at any other rate")
     figure = CODES[why.code].figure
-    raise StoppedError(
-        Finding("baud rate", "FAIL", figure, why.text.rstrip(";"), why.advice, {}, why.code)
-    )
+    raise StoppedError(Finding("baud rate", "FAIL", figure, why.text, why.advice, {}, why.code))
 
 
 def _other_motors(board: Board) -> Finding | None:

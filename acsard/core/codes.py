@@ -78,4 +78,6 @@ def received_text(code: str, text: str) -> str:
 
 def joined(why: Reason) -> Reason:
     """Return a reason with its advice at the end of its text."""
-    return replace(why, text=f"{why.text} {why.advice}", advice="") if why.advice else why
+    if not why.advice:
+        return why
+    return replace(why, text=f"{why.text}{CODES[why.code].joint} {why.advice}", advice="")

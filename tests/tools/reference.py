@@ -297,7 +297,7 @@ def codes() -> str:
 def _said(text: str) -> str:
     # A value that follows a word without a space is a clause that may be missing.
     always = re.sub(r"(?<=[\w)}]){\w+}", "", text)
-    return _flat(re.sub(r"{(\w+)[^}]*}", lambda match: match[1].upper(), always.rstrip(" ;:")))
+    return _flat(re.sub(r"{(\w+)[^}]*}", lambda match: match[1].upper(), always))
 
 
 # the page

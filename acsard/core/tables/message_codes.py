@@ -22,7 +22,7 @@ WARN unknown_source
 WARN not_finite
     the command contains NaN or infinity
 WARN too_many_senders
-    {seconds:g} other senders of this source are active;
+    {seconds:g} other senders of this source are active
     -> end one first
 WARN malformed
     the payload is not valid JSON, msgpack or CDR
