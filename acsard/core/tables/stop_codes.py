@@ -51,7 +51,7 @@ FAIL emergency_stop_silent | emergency stop not reported
 FAIL emergency_stop_missing
     safety.estop = "required", but the microcontroller has not reported an emergency-stop input:
     -> does its firmware send status lines with `estop=`?
-WARN bumper
+WARN bumper | bumper pressed
     {bumpers}
     -> release it at the robot
 FAIL bumpers_silent
