@@ -18,6 +18,7 @@ from typing import Any
 
 import pytest
 
+from acsard.bus import tls_trouble
 from acsard.checkup import outcomes, procedure
 from acsard.checkup.outcomes import OUTCOMES_BY_CODE
 from acsard.core import summary
@@ -36,7 +37,7 @@ SLOW = {
     "lost_lines_late", "lost_lines_silent", "measured_speeds_set_points", "motor_dead_turns",
     "motor_last_edge", "motor_other_motor", "motor_reversed_encoder", "motor_reversed_motor",
     "port_trouble", "replies_echo", "replies_set_points", "reply_form_only_text_between",
-    "reply_form_text", "reply_rate_lossy",
+    "reply_form_text", "reply_rate_lossy", "tls_handshake_hangs",
 }  # fmt: skip
 
 # No test of `tests/unit` and `tests/scenarios` is known to make the product find these. Real
@@ -103,6 +104,7 @@ def install() -> None:
     procedure.run = _check
     for module, name in (
         (outcomes, "find"),
+        (tls_trouble, "reason"),
         (summary, "waiting"),
         (diagnostics, "reason"),
         (certificate_expiry, "reason"),

@@ -82,7 +82,9 @@ def open_connection(where: Address, source: str = "app") -> Iterator[Connection]
     try:
         session = client_session(where.endpoint, where.tls)
     except UnreachableError as error:
-        raise UnreachableError("; ".join(filter(None, (str(error), where.advice)))) from None
+        advised = UnreachableError("; ".join(filter(None, (str(error), where.advice))))
+        advised.why = error.why
+        raise advised from None
     connection = Connection(session, where.robot_id, source, where.tls, where.endpoint)
     end_at_exit(connection)
     try:

@@ -13,7 +13,7 @@ from typing import Literal
 from msgspec import Struct
 from msgspec.structs import replace
 
-from acsard.core.tables.bus_codes import BUS, BusCode
+from acsard.core.tables.bus_codes import BUS, BusCode, TlsCode
 from acsard.core.tables.certificate_codes import CERTIFICATES, CertificateCode
 from acsard.core.tables.computer_codes import COMPUTER, ComputerCode
 from acsard.core.tables.file_codes import FILES, FileCode
@@ -33,7 +33,7 @@ RefusalCode = Literal[MessageCode, AgeCode]
 
 Code = Literal[
     StateCode, InputCode, MotorCode, LineCode, PoseCode, GyroCode, SourcesCode, MessageCode,
-    FileCode, CertificateCode, ComputerCode, BusCode,
+    FileCode, CertificateCode, ComputerCode, BusCode, TlsCode,
 ]  # fmt: skip
 
 CODES: dict[str, Entry] = {
