@@ -90,6 +90,8 @@ def _tls_trouble(plain: socket.socket, host: str, directory: str) -> Reason | No
             link.recv(1)
     except ssl.SSLCertVerificationError as error:
         return _server_certificate_error(error.verify_code, error.verify_message, host, directory)
+    except ssl.SSLEOFError:
+        return reason("tls_closed", host=host)
     except ssl.SSLError as error:
         return _client_certificate_error(error.reason or str(error), host, directory)
     except TimeoutError:

@@ -50,6 +50,8 @@ WARN from_future
 WARN too_old
     a command of {source} came {note} s after the beat that it echoes, but at most {seconds:g} s
     count: the network delays it
+    -> if this goes on, check the network between the program and the robot (`ping`), or raise the
+    timeout of the source in commands.sources
 WARN round_trip
     the round trip to {source} takes {note} s, but its timeout allows at most {seconds:g} s
     -> echo the newest beat, not an old one; if the network is as slow, raise the timeout of the
@@ -57,6 +59,7 @@ WARN round_trip
 WARN not_newer
     a command of {source} is not newer than the last accepted one of its sender: the network
     repeated or swapped commands, or the sender's stamps or numbers do not rise
+    -> let only one program use a sender id, and let it number its commands upward
 WARN copied
     a command of {source} is refused, because two programs send with this sender id: their numbers
     fall and come back
@@ -88,6 +91,7 @@ WARN too_many_clocks
     -> check their network, or type `acsard call activate`, which forgets them
 WARN stalled
     the daemon stalled: waiting for the next command of {source}
+    -> if this goes on, `acsard doctor` looks for what keeps this computer busy
 OK neutral
     send a zero first: {source} must send a zero{alone} before it can drive{lasts}{ros}
 OK zeros
@@ -100,8 +104,11 @@ OK equal
     -> wait until it is silent
 WARN senders
     {others} of this source must wait until the sender that drives falls silent
+    -> end all but one of these programs, or give each its own source
 WARN refused
     refused: {refused}
+    -> correct the program that sends it: `acsard echo events` has each refusal with its reason and its
+    sender
 WARN command_gaps
     usable commands of {source} came up to {seconds:.1f} s apart, but count for {timeout:g} s: the
     robot braked in between

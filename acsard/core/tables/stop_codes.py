@@ -33,6 +33,7 @@ OK switched_off
     -> type `acsard call activate`
 WARN other_version
     {cause} ({named})
+    -> another version of acsard stopped the robot: look at the robot, and type `acsard call clear`
 WARN stopped
     stopped by {by}
     -> look at the robot, and type `acsard call clear`
