@@ -96,7 +96,7 @@ async def watch_certificates(
     certificate.
     """
     routers = bus.tls_routers
-    answered, reading, said = 0, 0, _Said("certificate_valid", 0)
+    answered, reading, reported = 0, 0, _Reported("certificate_valid", 0)
     while True:
         expiries: dict[str, int] = {}
         try:
@@ -112,24 +112,24 @@ async def watch_certificates(
             # The TLS gateway reports the certificate that it uses.
             expiries.pop("", None)
         known.update(expiries)
-        said = _tell_of_change(known, said, tell)
+        reported = _tell_of_change(known, reported, tell)
         reading += 1
         await asyncio.sleep(EXPIRY_CHECK_PERIOD_S)
 
 
-class _Said(NamedTuple):
+class _Reported(NamedTuple):
     code: Code
     urgency: int
 
 
 def _tell_of_change(
-    known: Mapping[str, WallNs], said: _Said, tell: Callable[[Event], None]
-) -> _Said:
+    known: Mapping[str, WallNs], reported: _Reported, tell: Callable[[Event], None]
+) -> _Reported:
     if not known:
-        return said
+        return reported
     now_ns = clock.now().wall_ns
     why = expiry(known, now_ns, RENEW_ADVICE)
-    now = _Said(why.code, urgency(known, now_ns))
-    if now != said and why.level != "ok":
+    now = _Reported(why.code, urgency(known, now_ns))
+    if now != reported and why.level != "ok":
         tell(Event("certificate", joined(why).text, "warning", code=why.code))
     return now

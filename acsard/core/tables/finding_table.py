@@ -45,7 +45,7 @@ def code_of(name: str) -> str:
 
 
 def table(codes: object, text: str) -> dict[str, Entry]:
-    """Return the entries by code. `codes` is their `Literal`, or None. Raises `ValueError`."""
+    """Return the entries by code. `codes` is the `Literal` of their names. Raises `ValueError`."""
     entries = {}
     for entry in re.split(r"\n+(?! )", text.strip()):
         head, *rest = entry.splitlines()
@@ -58,6 +58,6 @@ def table(codes: object, text: str) -> dict[str, Entry]:
             _LEVEL_OF[mark], mark, unsure, subject, figure,
             text.removesuffix(":"), ":" if text.endswith(":") else ";", advice,
         )  # fmt: skip
-    if codes is not None and (wrong := set(get_args(codes)) ^ entries.keys()):
+    if wrong := set(map(code_of, get_args(codes))) ^ entries.keys():
         raise ValueError(f"of these, a type or a table of codes lacks: {sorted(wrong)}")
     return entries

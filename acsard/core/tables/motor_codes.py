@@ -30,7 +30,8 @@ MOTORS = table(
     """
 FAIL driver_fault
     the board reports a fault of a motor driver
-    -> repair the driver, or switch the robot off and on
+    -> let the driver cool, and check its supply, and its motor for a short circuit or a blocked
+    wheel; then switch the robot off and on, and type `acsard call clear`
 FAIL impossible_speeds
     the board reports impossible speeds ({cause})
     -> check the encoder of this wheel, its leads, and the counts per turn in the firmware; if the

@@ -107,8 +107,8 @@ WARN senders
     -> end all but one of these programs, or give each its own source
 WARN refused
     refused: {refused}
-    -> correct the program that sends it: `acsard echo events` has each refusal with its reason and its
-    sender
+    -> correct the program that sends it: `acsard echo events` has each refusal with its reason and
+    its sender
 WARN command_gaps
     usable commands of {source} came up to {seconds:.1f} s apart, but count for {timeout:g} s: the
     robot braked in between
