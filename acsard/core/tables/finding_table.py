@@ -59,5 +59,5 @@ def table(codes: object, text: str) -> dict[str, Entry]:
             text.removesuffix(":"), ":" if text.endswith(":") else ";", advice,
         )  # fmt: skip
     if wrong := set(map(code_of, get_args(codes))) ^ entries.keys():
-        raise ValueError(f"of these, a type or a table of codes lacks: {sorted(wrong)}")
+        raise ValueError(f"only in the type or only in the table of its file: {sorted(wrong)}")
     return entries
