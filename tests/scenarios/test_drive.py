@@ -17,7 +17,7 @@ from acsard.core.config.settings import (
 )
 from acsard.core.messages.schema import Beat, JointState, TFMessage
 from tests.scenarios.world import World
-from tests.wheels import FOUR, TWO, four_and_two
+from tests.wheels import FOUR, STEADY, TWO, four_and_two
 
 
 @pytest.fixture
@@ -27,7 +27,7 @@ def wheels() -> WheelMap:
 
 @pytest.fixture
 def world(wheels: WheelMap) -> World:
-    world = World(Config(mcu=McuConfig(wheels=wheels)))
+    world = World(Config(mcu=McuConfig(wheels=wheels), limits=STEADY))
     world.run(0.2)
     world.send(0.0)
     world.run(0.05)
