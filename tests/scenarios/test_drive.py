@@ -246,6 +246,7 @@ def test_the_course_robot_drives_and_turns_with_all_its_faults() -> None:
     world = World(
         Config(
             mcu=McuConfig(wheels=TWO, trailing_comma=True, reply_period=0.1),
+            limits=STEADY,
             sim=SimConfig(faults=faults, encoder_counts=385),
         )
     )
