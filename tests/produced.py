@@ -18,6 +18,7 @@ from typing import Any
 
 import pytest
 
+from acsard.bus import tls_trouble
 from acsard.checkup import outcomes, procedure
 from acsard.checkup.outcomes import OUTCOMES_BY_CODE
 from acsard.core import summary
@@ -36,24 +37,23 @@ SLOW = {
     "lost_lines_late", "lost_lines_silent", "measured_speeds_set_points", "motor_dead_turns",
     "motor_last_edge", "motor_other_motor", "motor_reversed_encoder", "motor_reversed_motor",
     "port_trouble", "replies_echo", "replies_set_points", "reply_form_only_text_between",
-    "reply_form_text", "reply_rate_lossy",
+    "reply_form_text", "reply_rate_lossy", "tls_handshake_hangs",
 }  # fmt: skip
 
 # No test of `tests/unit` and `tests/scenarios` is known to make the product find these. Real
 # processes, or tests of one function below the wrapped ones do. A new code is not for this list.
 ELSEWHERE = {
-    "bad_attachment", "bad_echo", "certificates_unreadable", "clock_wrong", "computer_hot",
-    "computer_steal", "configuration_doubtful", "copied", "daemon_absent", "daemon_behind_router",
-    "daemon_elsewhere", "displaced", "emergency_stop_released", "encoder_counts_many",
-    "encoder_counts_misnamed", "encoder_counts_not_turned", "equal", "from_future",
-    "gateway_absent", "gateway_open", "guard_no_checksum", "guard_no_command", "guard_no_link",
+    "certificates_unreadable", "clock_wrong", "computer_hot",
+    "computer_steal",     "daemon_elsewhere", "emergency_stop_released", "encoder_counts_many",
+    "encoder_counts_misnamed", "encoder_counts_not_turned",
+    "gateway_open", "guard_no_checksum", "guard_no_command", "guard_no_link",
     "guard_too_long", "gyro_in_degrees", "gyro_not_believed", "gyro_reversed", "lines_too_rare",
-    "link_stops_at_zeros", "no_attachment", "no_echo", "no_emergency_stop", "no_rate", "other_run",
-    "other_version", "out_of_range", "port_denied", "port_held_by_acsard", "port_not_serial",
-    "port_slow", "port_unknown_board", "recording_fails", "reply_period", "reply_rate_none",
-    "reply_rate_rare", "round_trip_none", "router_absent", "runaway_against", "second_sender",
-    "stamps", "stopped_by_others", "too_big", "too_many_clocks", "too_many_senders",
-    "unknown_encoding", "unknown_format", "wildcard", "wrong_wheels",
+    "link_stops_at_zeros", "no_emergency_stop",
+    "other_version", "port_denied", "port_held_by_acsard", "port_slow", "port_unknown_board",
+    "recording_fails", "reply_rate_none",
+    "reply_rate_rare", "round_trip_none", "runaway_against",
+    "stopped_by_others", "too_many_clocks",
+    "unknown_format",
 }  # fmt: skip
 
 LEAST = 2000  # collected tests of a run of all
@@ -103,6 +103,7 @@ def install() -> None:
     procedure.run = _check
     for module, name in (
         (outcomes, "find"),
+        (tls_trouble, "reason"),
         (summary, "waiting"),
         (diagnostics, "reason"),
         (certificate_expiry, "reason"),

@@ -14,6 +14,7 @@ import shutil
 import subprocess
 import sys
 import xml.etree.ElementTree as ET
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 from unittest.mock import MagicMock
@@ -261,6 +262,14 @@ def test_ros2_control_has_what_the_topic_hardware_needs(robot: Described) -> Non
 # controllers.yaml
 
 
+def agree(name: str, parameters: Mapping[str, Any], wanted: Mapping[str, Any]) -> None:
+    """Compare the values of a file of `deploy/ros2` with those of the robot."""
+    differ = {
+        key: (parameters.get(key), v) for key, v in wanted.items() if parameters.get(key) != v
+    }
+    assert not differ, f"deploy/ros2/{name} has other values than the configuration: {differ}"
+
+
 def test_the_controller_has_the_dimensions_and_limits_of_the_robot(robot: Described) -> None:
     parameters = ros_parameters("controllers.yaml", "/**/diff_drive_controller", robot.files)
     config, names = robot.config, robot.config.joint_names
@@ -289,7 +298,7 @@ def test_the_controller_has_the_dimensions_and_limits_of_the_robot(robot: Descri
         "angular.z.max_acceleration_reverse": -limits.angular_acceleration,
         "angular.z.max_deceleration_reverse": limits.angular_deceleration,
     }
-    assert {key: parameters.get(key) for key in wanted} == wanted
+    agree("controllers.yaml", parameters, wanted)
     assert {parameters["cmd_vel_timeout"]} == TIMEOUTS
 
 
@@ -302,15 +311,21 @@ def test_nav2_moves_within_the_limits(robot: Described) -> None:
     fastest = [limits.linear_speed, 0, limits.angular_speed]
     accelerations = [limits.linear_acceleration, 0, limits.angular_acceleration]
     decelerations = [limits.linear_deceleration, 0, limits.angular_deceleration]
-    assert smoother["max_velocity"] == fastest
-    assert smoother["min_velocity"] == [-v for v in fastest]
-    assert smoother["max_accel"] == accelerations
-    assert smoother["max_decel"] == [-a for a in decelerations]
+    agree("nav2_params.yaml", smoother, {
+        "max_velocity": fastest,
+        "min_velocity": [-v for v in fastest],
+        "max_accel": accelerations,
+        "max_decel": [-a for a in decelerations],
+    })  # fmt: skip
     assert {smoother["velocity_timeout"]} == TIMEOUTS
     follow = ros_parameters("nav2_params.yaml", "controller_server", robot.files)["FollowPath"]
-    assert (follow["vx_max"], follow["wz_max"]) == (limits.linear_speed, limits.angular_speed)
-    assert (follow["ax_max"], follow["az_max"]) == (accelerations[0], accelerations[2])
-    assert follow["ax_min"] == -limits.linear_deceleration
+    agree("nav2_params.yaml", follow, {
+        "vx_max": limits.linear_speed,
+        "wz_max": limits.angular_speed,
+        "ax_max": limits.linear_acceleration,
+        "az_max": limits.angular_acceleration,
+        "ax_min": -limits.linear_deceleration,
+    })  # fmt: skip
     behaviors = ros_parameters("nav2_params.yaml", "behavior_server", robot.files)
     assert behaviors["max_rotational_vel"] <= limits.angular_speed
     assert behaviors["rotational_acc_lim"] <= limits.angular_acceleration

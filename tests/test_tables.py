@@ -9,6 +9,5 @@ from tests.tools.tables import FILES, ROOT
 
 @pytest.mark.parametrize("name", FILES)
 def test_each_file_agrees_with_the_table_of_keys_and_roles(name: str) -> None:
-    """`python -m tests.tools.tables` writes the files again."""
     text = (ROOT / name).read_text()
-    assert FILES[name](text) == text
+    assert FILES[name](text) == text, f"`python -m tests.tools.tables` writes {name} again"

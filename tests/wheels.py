@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import pytest
 
-from acsard.core.config.settings import WheelMap
+from acsard.core.config.settings import LimitsConfig, WheelMap
 
 FOUR, TWO = WheelMap(), WheelMap(left="+l", right="+r")
 
@@ -16,3 +16,11 @@ MAPS = FOUR, TWO
 four_and_two = pytest.mark.parametrize(
     "wheels", [pytest.param(FOUR, id="four"), pytest.param(TWO, id="two")]
 )
+
+STEADY = LimitsConfig(
+    linear_acceleration=1.0,
+    linear_deceleration=1.0,
+    angular_acceleration=4.0,
+    angular_deceleration=4.0,
+)
+"""Ramps of tests whose numbers follow from them, whatever the defaults are."""

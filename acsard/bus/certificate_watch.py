@@ -16,9 +16,9 @@ from typing import NamedTuple
 from acsard.bus.tls_files import expiry_times, peer_ends_ns, unusable
 from acsard.bus.tls_trouble import RENEW_ADVICE
 from acsard.bus.zenoh_sessions import certificate_trouble
-from acsard.core.codes import Code
+from acsard.core.codes import Code, joined
 from acsard.core.config.settings import BusConfig
-from acsard.core.messages.certificate_expiry import expiry, short_code, urgency
+from acsard.core.messages.certificate_expiry import expiry, urgency
 from acsard.core.values import NS_PER_S, Event, WallNs
 from acsard.host import clock
 from acsard.host.threads import NoThreadError, in_thread
@@ -96,7 +96,7 @@ async def watch_certificates(
     certificate.
     """
     routers = bus.tls_routers
-    answered, reading, said = 0, 0, _Said("certificate_valid", 0)
+    answered, reading, reported = 0, 0, _Reported("certificate_valid", 0)
     while True:
         expiries: dict[str, int] = {}
         try:
@@ -112,25 +112,24 @@ async def watch_certificates(
             # The TLS gateway reports the certificate that it uses.
             expiries.pop("", None)
         known.update(expiries)
-        said = _tell_of_change(known, said, tell)
+        reported = _tell_of_change(known, reported, tell)
         reading += 1
         await asyncio.sleep(EXPIRY_CHECK_PERIOD_S)
 
 
-class _Said(NamedTuple):
+class _Reported(NamedTuple):
     code: Code
     urgency: int
 
 
 def _tell_of_change(
-    known: Mapping[str, WallNs], said: _Said, tell: Callable[[Event], None]
-) -> _Said:
+    known: Mapping[str, WallNs], reported: _Reported, tell: Callable[[Event], None]
+) -> _Reported:
     if not known:
-        return said
+        return reported
     now_ns = clock.now().wall_ns
     why = expiry(known, now_ns, RENEW_ADVICE)
-    now = _Said(why.code, urgency(known, now_ns))
-    if now != said and why.level != "ok":
-        text = f"{why.text}; {why.advice}"
-        tell(Event("certificate", text, "warning", kind=short_code(why), code=why.code))
+    now = _Reported(why.code, urgency(known, now_ns))
+    if now != reported and why.level != "ok":
+        tell(Event("certificate", joined(why).text, "warning", code=why.code))
     return now

@@ -20,6 +20,7 @@ from acsard.bus.tls_files import (
     host_and_port,
     load,
 )
+from acsard.core.codes import Reason, reason
 from acsard.core.values import NS_PER_S
 from acsard.host import clock
 
@@ -45,8 +46,8 @@ class DateError(IntEnum):
     EXPIRED = 10
 
 
-def trouble(endpoint: str, directory: str) -> str:
-    """Return why this machine cannot connect to a TLS endpoint, and how to fix that, or "".
+def trouble(endpoint: str, directory: str) -> Reason | None:
+    """Return why this machine cannot connect to a TLS endpoint, and how to fix that.
 
     Blocks for a few seconds, or longer if the lookup of the host name is slow.
     """
@@ -56,32 +57,19 @@ def trouble(endpoint: str, directory: str) -> str:
     try:
         plain = socket.create_connection((host, int(port)), HANDSHAKE_TIMEOUT_S)
     except TimeoutError:
-        return (
-            f"{host} does not answer on port {port}: is {host} switched on, and does a firewall "
-            "drop connections?"
-        )
+        return reason("tls_no_answer", host=host, port=port)
     except (OSError, ValueError, OverflowError) as error:
         # Since Python 3.13 the lookup also rejects an impossible port.
         if isinstance(error, socket.gaierror) and error.errno != socket.EAI_SERVICE:
-            return (
-                f"the name {host} does not resolve on this machine; write the robot's IP address "
-                "(`hostname -I` on the robot prints it; the robot's certificate must contain this "
-                "address), or fix DNS, mDNS or /etc/hosts"
-            )
+            return reason("tls_no_name", host=host)
         if isinstance(error, OSError) and error.errno in UNREACHABLE:
-            return (
-                f"{host} cannot be reached ({error.strerror}): is {host} switched on, is it in "
-                "this network, is the address right?"
-            )
-        return (
-            f"no program listens on port {port} of {host} ({error}); if a router should: is it "
-            "running? If a robot should: does bus.listen in its acsard.toml contain this address?"
-        )
+            return reason("tls_no_route", host=host, reason=error.strerror)
+        return reason("tls_no_program", host=host, port=port, reason=error)
     with plain:
         return _tls_trouble(plain, host, directory)
 
 
-def _tls_trouble(plain: socket.socket, host: str, directory: str) -> str:
+def _tls_trouble(plain: socket.socket, host: str, directory: str) -> Reason | None:
     import ssl
 
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
@@ -102,19 +90,17 @@ def _tls_trouble(plain: socket.socket, host: str, directory: str) -> str:
             link.recv(1)
     except ssl.SSLCertVerificationError as error:
         return _server_certificate_error(error.verify_code, error.verify_message, host, directory)
+    except ssl.SSLEOFError:
+        return reason("tls_closed", host=host)
     except ssl.SSLError as error:
         return _client_certificate_error(error.reason or str(error), host, directory)
     except TimeoutError:
         # If the handshake is over, the server waits for data: both ends have accepted the
         # certificates.
-        if shaken:
-            return ""
-        return f"{host} accepts the connection, but does not answer the TLS handshake: restart it"
+        return None if shaken else reason("tls_handshake_hangs", host=host)
     except OSError:
-        return (
-            f"{host} closes the connection immediately: does a TLS endpoint of acsard listen there?"
-        )
-    return ""
+        return reason("tls_closed", host=host)
+    return None
 
 
 def _wrong_date(certificate: Mapping[str, Any]) -> int:
@@ -128,48 +114,27 @@ def _wrong_date(certificate: Mapping[str, Any]) -> int:
     return 0
 
 
-def _server_certificate_error(code: int, reason: str, host: str, directory: str) -> str:
+def _server_certificate_error(code: int, why: str, host: str, directory: str) -> Reason:
     now = time.strftime("%Y-%m-%d %H:%M UTC", time.gmtime())
     match code:
         case DateError.EXPIRED:
-            return (
-                f"the certificate of {host} has expired, according to this machine's clock "
-                f"({now}); if the clock is right, {RENEW_ADVICE}"
-            )
+            return reason("tls_server_expired", host=host, now=now, renew=RENEW_ADVICE)
         case DateError.NOT_YET_VALID:
-            return (
-                f"the certificate of {host} is not valid yet, according to this machine's clock "
-                f"({now}); either correct this machine's clock (`timedatectl`), or correct the "
-                "clock of the machine that made the certificate and then renew the certificate"
-            )
+            return reason("tls_server_early", host=host, now=now)
         case 62 | 64:  # another host name, another IP address
-            return (
-                f"the certificate of the server is not for {host}; connect to a name or address "
-                f"that the certificate contains, or run `acsard tls renew --address {host}` on the "
-                "robot; the command says what to do next"
-            )
+            return reason("tls_server_other_name", host=host)
         case 2 | 7 | 18 | 19 | 20 | 21:  # no chain of signatures leads to the authority
-            return (
-                f"the authority in {directory}/{CA} did not sign the certificate of {host} "
-                f"({reason}); use a certificate directory that `acsard tls add` made for this robot"
+            return reason(
+                "tls_server_not_signed", host=host, directory=directory, ca=CA, reason=why
             )
-    return f"the certificate of {host} is not valid ({reason}); to make another one, {RENEW_ADVICE}"
+    return reason("tls_server_invalid", host=host, reason=why, renew=RENEW_ADVICE)
 
 
-def _client_certificate_error(reason: str, host: str, directory: str) -> str:
-    # `reason` is OpenSSL's name of the error, usually of an alert that the server sent.
+def _client_certificate_error(why: str, host: str, directory: str) -> Reason:
+    # `why` is OpenSSL's name of the error, usually of an alert that the server sent.
     certificate = f"{directory}/{CERTIFICATE}"
-    if reason == "SSLV3_ALERT_CERTIFICATE_EXPIRED":
-        return (
-            f"{host} says that {certificate} has expired or is not valid yet: if the clocks of "
-            f"this machine and of that host are right (`timedatectl`), {RENEW_ADVICE}"
-        )
-    if "_ALERT_" in reason:
-        return (
-            f"{host} does not accept {certificate} ({reason}), for example because the robot's "
-            "authority did not sign it; get one that `acsard tls add` made for this robot"
-        )
-    return (
-        f"{host} does not speak TLS on this port ({reason}); an endpoint without TLS begins with "
-        "tcp/"
-    )
+    if why == "SSLV3_ALERT_CERTIFICATE_EXPIRED":
+        return reason("tls_own_expired", host=host, certificate=certificate, renew=RENEW_ADVICE)
+    if "_ALERT_" in why:
+        return reason("tls_own_refused", host=host, certificate=certificate, reason=why)
+    return reason("tls_not_spoken", host=host, reason=why)

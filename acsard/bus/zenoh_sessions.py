@@ -17,6 +17,7 @@ import zenoh
 
 from acsard.bus.tls_files import CA, CERTIFICATE, KEY, files_in, host_and_port, require_usable
 from acsard.bus.tls_trouble import RENEW_ADVICE, trouble
+from acsard.core.codes import joined
 from acsard.core.config.settings import TLS_PREFIX, Config, is_tls
 from acsard.core.messages.keys_and_roles import IMU, SPEED_LIMIT, STOP, full_key, source_keys
 from acsard.host import clock
@@ -260,19 +261,20 @@ def client_session(endpoint: str, tls: str = "") -> zenoh.Session:
     try:
         return zenoh.open(_config(settings))
     except zenoh.ZError:
-        reason = ""
+        why = None
         if secured:
             require_accepted(*files_in(tls))
-            reason = trouble(endpoint, tls)
+            why = trouble(endpoint, tls)
         # The message leaves out Zenoh's own error, which names Zenoh's source files.
-        raise UnreachableError(
-            f"no daemon answers at {endpoint}: "
-            + (
-                reason
-                or "start it there: `acsard run`. If it runs, its bus.listen needs this address, "
-                f"and it serves {MAX_SESSIONS} clients at most"
-            )
-        ) from None
+        text = (
+            "start it there: `acsard run`. If it runs, its bus.listen needs this address, and it "
+            f"serves {MAX_SESSIONS} clients at most"
+            if why is None
+            else joined(why).text
+        )
+        error = UnreachableError(f"no daemon answers at {endpoint}: {text}")
+        error.why = why
+        raise error from None
 
 
 def _base(mode: str) -> dict[str, object]:

@@ -326,7 +326,7 @@ class Board:
 
     def _silence(self, motors: Motors, seconds: float) -> StoppedError:
         turned = [motor for motor, speed in enumerate(motors) if speed]
-        outcome = "link: stops" if turned else "link: stops at zeros"
+        outcome: outcomes.Outcome = "link: stops" if turned else "link: stops at zeros"
         names = motor_names(self.mcu, turned)
         # A delay of this computer that is much shorter than the silence cannot cause it.
         beyond_s = seconds - self._max_silence_s

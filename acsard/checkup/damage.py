@@ -65,10 +65,12 @@ def finding(board: Board, motors: Sequence[int]) -> Finding:
         return outcomes.find("damaged lines: inverted", names=names)
     if not took:
         return outcomes.find("damaged lines: right", lines=len(lines))
-    outcome = "lenient" if took.keys() <= HARMLESS_KINDS else "taken"
     kinds = {what for what, _ in lines}
     return outcomes.find(
-        f"damaged lines: {outcome}", took=len(took), kinds=len(kinds), which=", ".join(took)
+        "damaged lines: lenient" if took.keys() <= HARMLESS_KINDS else "damaged lines: taken",
+        took=len(took),
+        kinds=len(kinds),
+        which=", ".join(took),
     )
 
 

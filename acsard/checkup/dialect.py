@@ -58,9 +58,7 @@ def baud(board: Board) -> Finding:
     # The daemon says the same about bytes that are no good lines.
     why = data.reason(f"at {configured} baud {{}}; no good line at any other rate")
     figure = CODES[why.code].figure
-    raise StoppedError(
-        Finding("baud rate", "FAIL", figure, why.text.rstrip(";"), why.advice, {}, why.code)
-    )
+    raise StoppedError(Finding("baud rate", "FAIL", figure, why.text, why.advice, {}, why.code))
 
 
 def _other_motors(board: Board) -> Finding | None:
@@ -136,7 +134,7 @@ def form(board: Board) -> Finding | None:
         # The replies to the first lines were only late, or the board reports by its own clock.
         return None
     board.comma = not board.comma
-    return _comma_wrong(board, "refused")
+    return _comma_wrong(board, "trailing comma: refused")
 
 
 def _answers(board: Board, comma: bool) -> list[BoardReply]:
@@ -150,18 +148,23 @@ def comma(board: Board, kind: str) -> Finding:
     of this motor.
     """
     if board.comma != board.mcu.trailing_comma:
-        return _comma_wrong(board, "latched" if board.latched and board.comma else "disobeyed")
+        latched = board.latched and board.comma
+        return _comma_wrong(
+            board, "trailing comma: latched" if latched else "trailing comma: disobeyed"
+        )
     if kind == "late":
         return lateness.finding("trailing comma", board.lateness.since(0.0))
     if kind == "dead":
         return outcomes.find("trailing comma: dead", last=board.letters[-1])
-    how = "sent" if board.comma else "not sent"
-    return outcomes.find(f"trailing comma: {how}", {"mcu.trailing_comma": board.comma})
-
-
-def _comma_wrong(board: Board, how: str) -> Finding:
     return outcomes.find(
-        f"trailing comma: {how}",
+        "trailing comma: sent" if board.comma else "trailing comma: not sent",
+        {"mcu.trailing_comma": board.comma},
+    )
+
+
+def _comma_wrong(board: Board, outcome: outcomes.Outcome) -> Finding:
+    return outcomes.find(
+        outcome,
         {"mcu.trailing_comma": board.comma},
         figure="needed" if board.comma else "refused",
         form="with" if board.comma else "without",
@@ -210,9 +213,11 @@ def check(board: Board) -> Finding:
         return outcomes.find("checked link: missing", {"mcu.link_check": "off"})
     if not board.sealed:
         return outcomes.find("checked link: plain")
-    outcome = "off" if wanted == "off" else "in use"
-    figure = "checked, with samples" if board.sampled else "checked"
-    return outcomes.find(f"checked link: {outcome}", {"mcu.link_check": "on"}, figure=figure)
+    return outcomes.find(
+        "checked link: off" if wanted == "off" else "checked link: in use",
+        {"mcu.link_check": "on"},
+        figure="checked, with samples" if board.sampled else "checked",
+    )
 
 
 def rate(board: Board) -> Finding:
@@ -240,9 +245,14 @@ def rate(board: Board) -> Finding:
     most_s = MAX_REPLY_PERIOD_S
     rare, period = slow and gap_s > most_s, min(float(f"{gap_s:.1g}"), most_s)
     keys: dict[str, object] = {"mcu.reply_period": period if slow else configured}
-    outcome = "rare" if rare else "slow" if slow else "lossy" if lossy else "right"
     return outcomes.find(
-        f"reply rate: {outcome}",
+        "reply rate: rare"
+        if rare
+        else "reply rate: slow"
+        if slow
+        else "reply rate: lossy"
+        if lossy
+        else "reply rate: right",
         keys if 3 * gap_s > 1.1 * unset_s and not rare else {},
         rate=1 / gap_s,
         way="by its own clock" if board.own_clock else "as answers to lines",
@@ -266,5 +276,9 @@ def trip(board: Board) -> Finding:
         return outcomes.find("round trip: none")
     middle_s, longest_s = median(trips), max(trips)
     # An MCU usually takes 1 to 5 ms; beyond 8 ms it delays the control loop.
-    pace = "slow" if middle_s > 0.008 + 2 * board.line_s else "right"
-    return outcomes.find(f"round trip: {pace}", middle=middle_s * 1000, longest=longest_s * 1000)
+    slow = middle_s > 0.008 + 2 * board.line_s
+    return outcomes.find(
+        "round trip: slow" if slow else "round trip: right",
+        middle=middle_s * 1000,
+        longest=longest_s * 1000,
+    )

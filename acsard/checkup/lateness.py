@@ -25,7 +25,7 @@ MAX_LATENESS_S = motion.LINE_PERIOD_S
 MAX_PAUSE_S = motion.MIN_WATCHDOG_S
 
 
-NOT_JUDGED = "late: not judged"
+NOT_JUDGED: outcomes.Outcome = "late: not judged"
 
 
 class HostDelays:

@@ -42,5 +42,5 @@ def finding(board: Board, motors: Sequence[int], radius: float) -> Finding:
         least=least,
         motors=motor_names(board.mcu, still),
         ignored=too_slow,
-        way=too_slow * radius,
+        linear=too_slow * radius,
     )

@@ -68,15 +68,19 @@ def finding(board: Board) -> Finding:
             break
         board.drive(board.zero, 0.5, _period_s(board))
     board.lost = count.share
-    if board.lost <= MAX_LOSS:
-        outcome = "late" if silent_s else "few" if count.lost else "none"
+    outcome: outcomes.Outcome
+    if board.lost <= MAX_LOSS and silent_s:
+        outcome = "lost lines: late"
+    elif board.lost <= MAX_LOSS:
+        outcome = "lost lines: few" if count.lost else "lost lines: none"
     elif not count.damaged:
-        outcome = "silent" if board.own_clock else "either"
+        outcome = "lost lines: silent" if board.own_clock else "lost lines: either"
     else:
-        outcome = "back" if 2 * count.damaged > count.lost else "both"
+        mostly_back = 2 * count.damaged > count.lost
+        outcome = "lost lines: back" if mostly_back else "lost lines: both"
     last = board.unrecognized_lines[-1] if count.damaged else b""
     result = outcomes.find(
-        f"lost lines: {outcome}",
+        outcome,
         lines=count.lines,
         lost=count.lost,
         share=board.lost,
@@ -84,7 +88,7 @@ def finding(board: Board) -> Finding:
         damaged=count.damaged,
         last=printable_bytes(last, MAX_SHOWN_BYTES),
     )
-    if outcome in ("back", "both") and not board.sealed:
+    if outcome in ("lost lines: back", "lost lines: both") and not board.sealed:
         raise StoppedError(result)
     return result
 

@@ -46,6 +46,16 @@ Kind = Literal[
     "off",  # the error of the speed is larger than `WARN_TOLERANCE`
     "late",  # this computer was too late to judge the motor
 ]
+PLAIN_OUTCOMES: dict[Kind, outcomes.Outcome] = {
+    "right": "motor: right",
+    "several": "motor: several",
+    "one way": "motor: one way",
+    "last edge": "motor: last edge",
+    "no sign": "motor: no sign",
+    "size": "motor: size",
+    "off": "motor: off",
+}
+
 # Only the motor's own encoder moves, in the right direction.
 FOLLOWING_KINDS: tuple[Kind, ...] = ("right", "off", "size", "last edge")
 
@@ -135,9 +145,8 @@ def encoder_finding(mcu: McuConfig, channel: Channel) -> Finding:
         if channel.kind == "size"
         else 0.0
     )
-    loose = channel.kind in FOLLOWING_KINDS and channel.wheel == ""
     return outcomes.find(
-        "motor: loose" if loose else f"motor: {channel.kind}{_fault_suffix(mcu, channel)}",
+        _outcome(mcu, channel),
         name=motor_name(mcu, motor),
         figure=f"{forth:+.2f} {'rad/s, probed' if channel.probed else f'{back:+.2f} rad/s'}",
         shown=", ".join(f"encoder {letters[m]} {channel.forth[m]:+.2f}" for m in moved),
@@ -153,22 +162,29 @@ def encoder_finding(mcu: McuConfig, channel: Channel) -> Finding:
     )
 
 
-def _fault_suffix(mcu: McuConfig, channel: Channel) -> str:
+def _outcome(mcu: McuConfig, channel: Channel) -> outcomes.Outcome:
     wheel, sign = wheel_of(mcu, channel.motor)
     answer = channel.wheel
+    if channel.kind in FOLLOWING_KINDS and answer == "":
+        return "motor: loose"
     match channel.kind:
         case "dead" if answer is not None:
-            return ", turns" if answer else ", still"
+            return "motor: dead, turns" if answer else "motor: dead, still"
+        case "dead":
+            return "motor: dead, not seen"
         case "reversed" if answer == wheel:
-            return ", encoder" if channel.forward == (sign > 0) else ", motor"
+            right = channel.forward == (sign > 0)
+            return "motor: reversed, encoder" if right else "motor: reversed, motor"
+        case "reversed":
+            return "motor: reversed, not seen"
         case "other" if answer == wheel:
-            return ", encoder"
+            return "motor: other, encoder"
         case "other" if answer == wheel_of(mcu, channel.moved[0])[0]:
-            return ", motor"
-        case "dead" | "reversed" | "other":
-            return ", not seen"
-        case _:
-            return ""
+            return "motor: other, motor"
+        case "other":
+            return "motor: other, not seen"
+        case kind:
+            return PLAIN_OUTCOMES[kind]
 
 
 def stands(channel: Channel) -> bool:
@@ -197,9 +213,14 @@ def wheel_map(mcu: McuConfig, channels: Sequence[Channel]) -> Finding:
         entries[wheel] = f"{'+' if sign > 0 else '-'}{letter}"
     names = WHEEL_ANSWERS[len(channels)].values()
     wrong = [wheel for wheel in names if entries[wheel] != getattr(mcu.wheels, wheel)]
-    outcome = "other" if wrong else "faulty" if faulty else "partly" if unseen else "right"
     return outcomes.find(
-        f"wheel map: {outcome}",
+        "wheel map: other"
+        if wrong
+        else "wheel map: faulty"
+        if faulty
+        else "wheel map: partly"
+        if unseen
+        else "wheel map: right",
         {} if faulty else {f"mcu.wheels.{wheel}": entries[wheel] for wheel in names},
         map=" ".join(entries[wheel] for wheel in names),
         wheels=", ".join(map(with_spaces, wrong)),

@@ -2,10 +2,46 @@
 
 from __future__ import annotations
 
+from typing import Literal
+
 from msgspec import convert
 
 from acsard.checkup.findings import Finding, Verdict
 from acsard.core.tables.finding_table import code_of, table
+
+Outcome = Literal[
+    "baud rate: right", "baud rate: other", "baud rate: other motors", "identification: named",
+    "identification: none", "identification: echo", "reply form: right", "reply form: other",
+    "reply form: text", "reply form: only text between", "replies: echo", "replies: set points",
+    "reply rate: right", "reply rate: lossy", "reply rate: slow", "reply rate: rare",
+    "reply rate: none", "reply times: even", "reply times: bunched", "round trip: right",
+    "round trip: slow", "round trip: own clock", "round trip: none", "checked link: in use",
+    "checked link: off", "checked link: plain", "checked link: missing", "lost lines: none",
+    "lost lines: few", "lost lines: late", "lost lines: back", "lost lines: both",
+    "lost lines: either", "lost lines: silent", "motor: right", "motor: off", "motor: loose",
+    "motor: dead, not seen", "motor: dead, still", "motors: still", "motor: dead, turns",
+    "motor: reversed, not seen", "motor: reversed, encoder", "motor: reversed, motor",
+    "motor: other, not seen", "motor: other, encoder", "motor: other, motor", "motor: several",
+    "motor: one way", "motor: last edge", "motor: no sign", "motor: size", "trailing comma: sent",
+    "trailing comma: not sent", "trailing comma: dead", "trailing comma: refused",
+    "trailing comma: disobeyed", "trailing comma: latched", "measured speeds: set points",
+    "wheel map: not seen", "wheel map: partly", "wheel map: faulty", "wheel map: right",
+    "wheel map: other", "wheel map: twice", "least speed: small", "least speed: large",
+    "least speed: untested", "top speed: reached", "top speed: short", "top speed: overflow",
+    "top speed: backward", "top speed: no watchdog", "top speed: damaged lines",
+    "top speed: not chosen", "top speed: untested", "encoder counts: none",
+    "encoder counts: coarse", "encoder counts: damaged", "encoder counts: not turned",
+    "encoder counts: unequal", "encoder counts: backward", "encoder counts: misnamed",
+    "encoder counts: many", "encoder counts: right", "encoder counts: wrong", "watchdog: untested",
+    "watchdog: weak", "watchdog: none", "watchdog: late", "watchdog: early", "watchdog: unclear",
+    "watchdog: fed", "watchdog: right", "damaged lines: untested", "damaged lines: right",
+    "damaged lines: lenient", "damaged lines: inverted", "damaged lines: taken", "inputs: none",
+    "inputs: not pressed", "inputs: right", "inputs: missing", "inputs: wrong",
+    "wheels: not lifted", "stall: seen", "runaway: along", "runaway: against", "stop: turns",
+    "restarts: seen", "restarts: supply", "restarts: motors", "restarts: watchdog",
+    "restarts: pin", "restarts: silence", "restarts: gone", "link: stops", "link: stops at zeros",
+    "late: not judged", "serial line: lost",
+]  # fmt: skip
 
 # A "?" after the verdict marks an outcome that this computer can cause by running the check too
 # late, even if the board works correctly.
@@ -223,7 +259,7 @@ FAIL wheel map: twice
 
 PASS least speed: small | {least:g} rad/s
 WARN? least speed: large | {least:g} rad/s
-    at {ignored:g} rad/s, which is {way:.2f} m/s, this motor or these do not turn: {motors}. A
+    at {ignored:g} rad/s, which is {linear:.2f} m/s, this motor or these do not turn: {motors}. A
     planner's small speeds have no effect then, and its goals are reached late or never
     -> let the firmware control the speed of the motors (the sketch does), or raise the least speed
     of the planner above this
@@ -232,8 +268,9 @@ SKIPPED least speed: untested
     -> fix the motors above, and check again
 PASS top speed: reached | {top:.1f} rad/s
 WARN? top speed: short | {most:.1f} of {speed:.1f} rad/s
-    the limits allow {top:.1f} rad/s, which is {way:.2f} m/s at the wheel, but this motor or these
-    stay behind, with the wheels in the air: {motors}. The daemon then says that the wheel is slow
+    the limits allow {top:.1f} rad/s, which is {linear:.2f} m/s at the wheel, but this motor or
+    these stay behind, with the wheels in the air: {motors}. The daemon then says that the wheel is
+    slow
     -> write a lower limits.linear_speed or limits.angular_speed, or check the supply of the motors
 FAIL top speed: overflow | {most:.1f} at {speed:.1f} rad/s
     up to {below:.1f} rad/s the board reports the right direction; on the way to {speed:.1f} rad/s
@@ -379,35 +416,35 @@ FAIL stop: turns | turns {seconds:g} s after zeros
     must stop a motor at `p00.00`. If it stands, the firmware must report `p00.00`, not its last
     speed
 FAIL restarts: seen | {times}
-    the board restarted {told}
+    the board restarted {events}
     -> is the supply weak (brown-out when motors start, a USB hub)? Use a separate supply for the
     board, thicker leads, a common ground. Does a second program open the port (DTR resets many
     boards)?
     Otherwise its own watchdog or a crash of its firmware restarts it
 FAIL restarts: supply | {times}
-    the supply of the board failed. The board restarted {told}
+    the supply of the board failed. The board restarted {events}
     -> use a separate supply for the board, not the motors' supply or a USB hub; use thicker leads,
     a common ground and a capacitor at the driver; is a plug loose?
 FAIL restarts: motors | {times}
-    the board restarted {told}. Motors turned at each restart, so the supply may be weak
+    the board restarted {events}. Motors turned at each restart, so the supply may be weak
     -> use a separate supply for the board, thicker leads, a common ground and a capacitor at the
     driver. If the supply is good, the firmware's own watchdog or a crash restarts the board
 FAIL restarts: watchdog | {times}
-    the board's own watchdog restarted it, so the firmware hung. The board restarted {told}
+    the board's own watchdog restarted it, so the firmware hung. The board restarted {events}
     -> where does the firmware wait: for room to print, for an encoder, in an interrupt? Feed the
     watchdog only in the main loop. A supply that dips can also hang the firmware
 FAIL restarts: pin | {times}
-    something pulled the board's reset pin. The board restarted {told}
+    something pulled the board's reset pin. The board restarted {events}
     -> does a second program open the port (DTR resets many boards): a serial monitor,
     ModemManager, another computer? `fuser DEVICE` names it. Otherwise, is a long lead connected to
     the reset pin?
 FAIL restarts: silence | {times}
-    the board restarted {told}. Before each restart, this computer had sent nothing for
+    the board restarted {events}. Before each restart, this computer had sent nothing for
     {silent:.1f} s or more
     -> the firmware's watchdog restarts the whole board when no line comes: let that watchdog only
     stop the motors, and restart the board only when the firmware hangs
 FAIL restarts: gone | {times}
-    the board restarted {told}, and did not answer again within {patience:g} s
+    the board restarted {events}, and did not answer again within {patience:g} s
     -> switch it off and on; does its bootloader hang after a reset by the watchdog, or does its
     supply fail?
 FAIL? link: stops | silent for {seconds:.1f} s
@@ -436,10 +473,10 @@ class TimingFinding(Finding, frozen=True):
     margin_s: float = 0.0
 
 
-OUTCOMES_BY_CODE = table(None, OUTCOMES)
+OUTCOMES_BY_CODE = table(Outcome, OUTCOMES)
 
 
-def find(outcome: str, keys: dict[str, object] | None = None, **values: object) -> Finding:
+def find(outcome: Outcome, keys: dict[str, object] | None = None, **values: object) -> Finding:
     """Return the finding for an outcome such as "baud rate: right", with the values in its texts.
 
     The value `name` replaces the name of the finding, and `margin_s` is stored if the outcome is

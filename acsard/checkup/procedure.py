@@ -233,12 +233,14 @@ class _Steps:
             )
         self._take("", lambda: inputs.finding(board, operator, safety))
 
-    def _refusal(self, watchdog: Finding | None, damaged_lines: Finding | None) -> str:
+    def _refusal(
+        self, watchdog: Finding | None, damaged_lines: Finding | None
+    ) -> outcomes.Outcome | None:
         if not _sound(watchdog):
-            return "no watchdog"
+            return "top speed: no watchdog"
         if not _sound(damaged_lines):
-            return "damaged lines"
-        return "" if self._fast else "not chosen"
+            return "top speed: damaged lines"
+        return None if self._fast else "top speed: not chosen"
 
     def _stop_and_arm(self) -> None:
         self._board.stop_motors()

@@ -32,7 +32,7 @@ def finding(board: Board) -> Finding | None:
     bunched = sum(gap < close_s for gap in gaps) / len(gaps)
     blocks = bunched > MAX_BUNCHED and longest_s > SILENCE_FACTOR * usual_s
     return outcomes.find(
-        f"reply times: {'bunched' if blocks else 'even'}",
+        "reply times: bunched" if blocks else "reply times: even",
         middle=median(gaps) * 1000,
         high=gaps[len(gaps) * 99 // 100] * 1000,
         longest=longest_s * 1000,

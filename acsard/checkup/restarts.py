@@ -36,7 +36,12 @@ CLOCK_RANGE_MS = 65536  # time after which the board's clock overflows and conti
 MIN_SILENCE_S = 0.25
 
 # From the causes of the reference firmware to outcomes, without "restarts: ".
-CAUSES = {"power": "supply", "brown-out": "supply", "watchdog": "watchdog", "pin": "pin"}
+CAUSES: dict[str, outcomes.Outcome] = {
+    "power": "restarts: supply",
+    "brown-out": "restarts: supply",
+    "watchdog": "restarts: watchdog",
+    "pin": "restarts: pin",
+}
 
 # Pattern of three letters in a row, by which a text is recognized. A reply does not contain them,
 # even if it is damaged.
@@ -158,9 +163,9 @@ def finding(mcu: McuConfig, restarts: Sequence[Restart], back: bool = True) -> F
     """Return the finding about one or more `restarts`; `back` says whether the board answered."""
     each = Counter(_restart_texts(mcu, restart) for restart in restarts)
     return outcomes.find(
-        f"restarts: {_outcome(restarts) if back else 'gone'}",
+        _outcome(restarts) if back else "restarts: gone",
         times=f"restarted, {_times(len(restarts))}".removesuffix(", "),
-        told="; ".join(
+        events="; ".join(
             f"{_times(n)} while {when}: {sign}".lstrip() for (when, sign), n in each.items()
         ),
         silent=min(restart.silent_s for restart in restarts),
@@ -168,15 +173,16 @@ def finding(mcu: McuConfig, restarts: Sequence[Restart], back: bool = True) -> F
     )
 
 
-def _outcome(restarts: Sequence[Restart]) -> str:
+def _outcome(restarts: Sequence[Restart]) -> outcomes.Outcome:
     causes = {CAUSES[restart.cause] for restart in restarts if restart.cause in CAUSES}
-    if len(causes) == 1 and not (causes == {"watchdog"} and _silent(restarts)):
+    if len(causes) == 1 and not (causes == {"restarts: watchdog"} and _silent(restarts)):
         return causes.pop()
     if len(restarts) == 1:
-        return "seen"
+        return "restarts: seen"
     if _silent(restarts):
-        return "silence"
-    return "motors" if all(any(restart.turned) for restart in restarts) else "seen"
+        return "restarts: silence"
+    turned = all(any(restart.turned) for restart in restarts)
+    return "restarts: motors" if turned else "restarts: seen"
 
 
 def _silent(restarts: Sequence[Restart]) -> bool:

@@ -22,42 +22,49 @@ AGAINST, AGAINST_SHARE = 3, 0.25
 
 
 def finding(
-    board: Board, motors: Sequence[int], refusal: str, top: float, radius: float
+    board: Board,
+    motors: Sequence[int],
+    refusal: outcomes.Outcome | None,
+    top: float,
+    radius: float,
 ) -> Finding:
     """Raise the motors to `top` rad/s, and stop them; `radius` is of a wheel, m.
 
-    `refusal` is the outcome that forbids it, such as "no watchdog", or "".
+    `refusal` is the outcome that forbids it.
     """
-    if refusal or not motors:
-        return outcomes.find(f"top speed: {refusal if motors else 'untested'}", top=top)
+    if not motors:
+        return outcomes.find("top speed: untested", top=top)
+    if refusal is not None:
+        return outcomes.find(refusal, top=top)
     # A motor that is backward at the speed at which it was right alone is not driven faster.
     first = min(top, motion.SPEED)
     rising = [top * step / STEPS for step in range(1, STEPS + 1)]
     # `Board.settles` restores it when the motors stand still, also after a restart.
     board.most_speed = 1.5 * max(top, motion.SPEED)
-    outcome, means, speed = "reached", board.zero, 0.0
+    outcome: outcomes.Outcome = "top speed: reached"
+    means, speed = board.zero, 0.0
     for following in (first, *(speed for speed in rising if speed > first)):
-        right, speed, began = speed, following, len(board.replies)
-        means = _raise(board, motors, right, speed)
+        passed, speed, began = speed, following, len(board.replies)
+        means = _raise(board, motors, passed, speed)
         recent = board.replies[began:]
         if any(_against(recent, motor, speed) for motor in motors):
-            outcome = "overflow" if right else "backward"
+            outcome = "top speed: overflow" if passed else "top speed: backward"
             break
         # The first speed is too low for the short measurements of a coarse encoder.
         judged = speed > first or speed == top
         if judged and min(means[motor] for motor in motors) < (1 - FAIL_TOLERANCE) * speed:
-            outcome = "short"
+            outcome = "top speed: short"
             break
     worst = min(motors, key=lambda motor: means[motor])
     slow = [motor for motor in motors if means[motor] < (1 - FAIL_TOLERANCE) * speed]
     board.stop_motors()
     return outcomes.find(
-        f"top speed: {outcome}",
+        outcome,
         top=top,
-        way=top * radius,
+        linear=top * radius,
         most=means[worst],
         speed=speed,
-        below=right,
+        below=passed,
         motors=motor_names(board.mcu, slow or [worst], ", "),
     )
 
@@ -65,8 +72,8 @@ def finding(
 def _raise(board: Board, motors: Sequence[int], low: float, high: float) -> Motors:
     steps = max(1, round((high - low) / RAMP / board.period_s))
     for step in range(1, steps + 1):
-        told = round(low + (high - low) * step / steps, 2)
-        board.drive(board.only(motors, told), board.period_s)
+        command = round(low + (high - low) * step / steps, 2)
+        board.drive(board.only(motors, command), board.period_s)
     look_s = max(motion.SHORT_MEASUREMENT_S, 2.5 * board.gap_s)
     end_s, before = board.now_s + motion.MOTOR_TIMEOUT_S, 0.0
     while True:

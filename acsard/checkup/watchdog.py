@@ -85,16 +85,19 @@ def _judged(least_s: float, most_s: float) -> Finding:
     figure = f"{middle_s * 1000:.0f} ms" + (f" ± {half_s * 1000:.0f}" if half_s >= 0.005 else "")
     # The measurement is not more accurate than 0.01 s.
     least_s, most_s = round(least_s, 2), round(most_s, 2)
-    if least_s > motion.MAX_WATCHDOG_S:
-        outcome = "late"
-    elif most_s < motion.MIN_WATCHDOG_S:
-        outcome = "early"
-    elif most_s > motion.MAX_WATCHDOG_S:
-        outcome = "unclear"
-    else:
-        outcome = "right"
-    beyond_s = least_s - motion.MAX_WATCHDOG_S if outcome == "late" else 0.0
-    return outcomes.find(f"watchdog: {outcome}", figure=figure, seconds=middle_s, margin_s=beyond_s)
+    beyond_s = least_s - motion.MAX_WATCHDOG_S
+    return outcomes.find(
+        "watchdog: late"
+        if beyond_s > 0
+        else "watchdog: early"
+        if most_s < motion.MIN_WATCHDOG_S
+        else "watchdog: unclear"
+        if most_s > motion.MAX_WATCHDOG_S
+        else "watchdog: right",
+        figure=figure,
+        seconds=middle_s,
+        margin_s=max(0.0, beyond_s),
+    )
 
 
 def measured(board: Board, motors: Sequence[int], stop: Run) -> Bounds:

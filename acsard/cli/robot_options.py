@@ -16,6 +16,7 @@ from acsard.bus.tls_trouble import trouble
 from acsard.cli.common import add_config, load
 from acsard.client.connection import Connection, open_connection
 from acsard.client.follower import FIRST_STATE_TIMEOUT_S
+from acsard.core.codes import joined
 from acsard.core.config.live import flat
 from acsard.core.config.settings import TLS_PREFIX, Config
 from acsard.core.formatting import printable
@@ -214,4 +215,5 @@ def _ceased(robot: Connection) -> str:
 def _of_link(where: Address) -> str:
     # "": no fault is found, or no TLS is used.
     secured = where.tls and where.endpoint.startswith(TLS_PREFIX)
-    return trouble(where.endpoint, where.tls) if secured else ""
+    why = trouble(where.endpoint, where.tls) if secured else None
+    return "" if why is None else joined(why).text

@@ -29,8 +29,8 @@ text of an error says what to do:
     UnreachableError   ConnectionError  no daemon listens at the endpoint
     NoAnswerError      TimeoutError     the robot does not exist or is stuck, or you may not query
                                         the key
-    ReplyError         RuntimeError     the daemon reports a failure; a service that refuses says so
-                                        in its reply instead
+    ReplyError         RuntimeError     the robot refuses a `call`, `set`, `stop` or `clear`, or
+                                        the daemon reports a failure
     NotDrivenError     RuntimeError     the robot does not follow your commands: it is stopped or in
                                         fault, another client drives it, or your role may not drive;
                                         or your program sent no command for 0.5 s, because it was

@@ -14,7 +14,13 @@ from typing import TypeVar
 
 from acsard.bus.address import address_by_environment
 from acsard.bus.zenoh_sessions import client_session
-from acsard.client.connection import REPLY_TIMEOUT_S, Connection, close, end_at_exit
+from acsard.client.connection import (
+    REPLY_TIMEOUT_S,
+    Connection,
+    accepted,
+    close,
+    end_at_exit,
+)
 from acsard.client.driving import Driver, Steps, UnheardError, drive, move, turn
 from acsard.client.identity import ClientIdentity
 from acsard.client.reads import AsyncReads
@@ -142,11 +148,11 @@ class AsyncClient(AsyncReads):
 
     async def call(self, service: str, **fields: object) -> schema.ServiceReply:
         """Call a service and return its reply, as `Client.call` does."""
-        return await _in_thread(lambda: self._connection.call(service, **fields))
+        return accepted(await _in_thread(lambda: self._connection.call(service, **fields)))
 
     async def set(self, settings: Mapping[str, Plain]) -> schema.ServiceReply:
         """Change settings of the daemon and return the reply, as `Client.set` does."""
-        return await _in_thread(lambda: self._connection.set(settings))
+        return accepted(await _in_thread(lambda: self._connection.set(settings)))
 
     async def whoami(self) -> ClientIdentity:
         """Return this client's role and name at the robot, as `Client.whoami` does."""

@@ -82,7 +82,9 @@ def open_connection(where: Address, source: str = "app") -> Iterator[Connection]
     try:
         session = client_session(where.endpoint, where.tls)
     except UnreachableError as error:
-        raise UnreachableError("; ".join(filter(None, (str(error), where.advice)))) from None
+        advised = UnreachableError("; ".join(filter(None, (str(error), where.advice))))
+        advised.why = error.why
+        raise advised from None
     connection = Connection(session, where.robot_id, source, where.tls, where.endpoint)
     end_at_exit(connection)
     try:
@@ -179,6 +181,13 @@ class _CommandSpacing:
             yield
             self._last_s = time.monotonic()
             self._next_s = max(self._next_s, self._last_s + MIN_SPACING_S)
+
+
+def accepted(reply: schema.ServiceReply) -> schema.ServiceReply:
+    """Return the reply. Raises `ReplyError` if it is a refusal: a program must not miss it."""
+    if not reply.success:
+        raise ReplyError(reply.message)
+    return reply
 
 
 class Connection(Reads):

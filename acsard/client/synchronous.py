@@ -8,7 +8,7 @@ from contextlib import closing, contextmanager
 
 from acsard.bus.address import address_by_environment
 from acsard.bus.subscription import Subscription
-from acsard.client.connection import Connection, open_connection
+from acsard.client.connection import Connection, accepted, open_connection
 from acsard.client.driving import Driver, Steps, UnheardError, drive, move, turn
 from acsard.client.identity import ClientIdentity
 from acsard.client.reads import Reads
@@ -128,7 +128,7 @@ class Client(Reads):
     def call(self, service: str, **fields: object) -> ServiceReply:
         """Call a service, such as "reset_odometry", and return its reply.
 
-        `fields` are the fields of the payload.
+        Raises `ReplyError` if the robot refuses. `fields` are the fields of the payload.
 
         The service "clear" releases faults and stops, and "activate" switches on an inactive robot.
         Both release only the causes whose `numbers` they name. Without the field `numbers`, this
@@ -136,15 +136,15 @@ class Client(Reads):
         decided to make the call because of an earlier state, pass the numbers of that state:
         `numbers=[cause.number for cause in state.causes]`. A later stop then stays.
         """
-        return self._connection.call(service, **fields)
+        return accepted(self._connection.call(service, **fields))
 
     def set(self, settings: Mapping[str, Plain]) -> ServiceReply:
         """Change settings of the daemon, for example `{"rates.odom": 5.0}`, and return the reply.
 
-        The daemon changes all of the settings or none. The change lasts until the next start of the
-        daemon.
+        The daemon changes all of the settings, or none and `ReplyError` is raised. The change lasts
+        until the next start of the daemon.
         """
-        return self._connection.set(settings)
+        return accepted(self._connection.set(settings))
 
     def whoami(self) -> ClientIdentity:
         """Return this client's role and name at the robot. The role is "" if it is unknown."""

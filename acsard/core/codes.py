@@ -13,7 +13,7 @@ from typing import Literal
 from msgspec import Struct
 from msgspec.structs import replace
 
-from acsard.core.tables.bus_codes import BUS, BusCode
+from acsard.core.tables.bus_codes import BUS, BusCode, TlsCode
 from acsard.core.tables.certificate_codes import CERTIFICATES, CertificateCode
 from acsard.core.tables.computer_codes import COMPUTER, ComputerCode
 from acsard.core.tables.file_codes import FILES, FileCode
@@ -33,7 +33,7 @@ RefusalCode = Literal[MessageCode, AgeCode]
 
 Code = Literal[
     StateCode, InputCode, MotorCode, LineCode, PoseCode, GyroCode, SourcesCode, MessageCode,
-    FileCode, CertificateCode, ComputerCode, BusCode,
+    FileCode, CertificateCode, ComputerCode, BusCode, TlsCode,
 ]  # fmt: skip
 
 CODES: dict[str, Entry] = {
@@ -78,4 +78,6 @@ def received_text(code: str, text: str) -> str:
 
 def joined(why: Reason) -> Reason:
     """Return a reason with its advice at the end of its text."""
-    return replace(why, text=f"{why.text} {why.advice}", advice="") if why.advice else why
+    if not why.advice:
+        return why
+    return replace(why, text=f"{why.text}{CODES[why.code].joint} {why.advice}", advice="")

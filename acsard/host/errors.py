@@ -11,6 +11,7 @@ from enum import IntEnum
 
 import msgspec
 
+from acsard.core.codes import Reason
 from acsard.core.values import AcsardError
 
 # Only the first one is documented.
@@ -35,6 +36,7 @@ class MendableError(AcsardError):
     """An error whose cause a person can fix. Its text says how."""
 
     code: Exit = Exit.FAILURE  # exit code of a subcommand that ends with this error
+    why: Reason | None = None  # the finding that its text says, if it has a code
 
 
 class UsageError(MendableError, ValueError):
@@ -56,7 +58,7 @@ class NoAnswerError(MendableError, TimeoutError):
 
 
 class ReplyError(MendableError, RuntimeError):
-    """The daemon's reply says that the request failed, or the reply cannot be decoded."""
+    """The reply is a refusal or a failure, or it cannot be decoded."""
 
 
 class NotDrivenError(MendableError, RuntimeError):

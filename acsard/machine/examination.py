@@ -20,7 +20,7 @@ from acsard.bus.address import Address, address_of
 from acsard.bus.tls_files import host_and_port
 from acsard.bus.zenoh_sessions import answers, reachable
 from acsard.client.connection import Connection, open_connection
-from acsard.core.codes import reason
+from acsard.core.codes import CODES, reason
 from acsard.core.config.contradictions import is_loopback, warnings
 from acsard.core.config.live import differences
 from acsard.core.config.parsing import ConfigError, from_builtins, parse
@@ -157,6 +157,8 @@ def query_or_finding(config: Config, address: Address) -> Running | Finding:
     except NoAnswerError as error:
         return finding("daemon_silent", error=error)
     except MendableError as error:
+        if error.why is not None:
+            return about(CODES["daemon_refuses"].subject, error.why)
         # The text of such an error contains the advice.
         return finding("daemon_refuses", error=error)
     except AcsardError as error:

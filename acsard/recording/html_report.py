@@ -45,10 +45,12 @@ JUMP_M = 1.0  # no robot drives so far between two messages: its pose was set
 
 # Plotly's own, so that a curve has one colour in both diagrams of the speeds.
 PALETTE = ("#1f77b4", "#ff7f0e", "#2ca02c", "#d62728", "#9467bd", "#8c564b")
-BAD, WARN, GOOD, REST, NEUTRAL = "#d43d3d", "#e08600", "#159a6b", "#8fb8de", "#9a9a9a"
+BAD, WARN, GOOD, REST, WAIT, NEUTRAL = (
+    "#d43d3d", "#e08600", "#159a6b", "#8fb8de", "#a98fd0", "#9a9a9a"
+)  # fmt: skip
 COLOURS = {
-    "driving": GOOD, "ready": REST, "waiting": WARN, "stopped": WARN, "fault": BAD,
-    "up": REST, "booting": WARN, "stale": WARN, "down": BAD, "drives": GOOD, "waits": WARN,
+    "driving": GOOD, "ready": REST, "waiting": WAIT, "stopped": WARN, "fault": BAD,
+    "up": REST, "booting": WAIT, "stale": WARN, "down": BAD, "drives": GOOD, "waits": WAIT,
     "debug": NEUTRAL, "info": REST, "warning": WARN, "error": BAD,
 }  # fmt: skip
 
@@ -308,11 +310,15 @@ def _event_table(drawing: Drawing) -> str:
     return f"<h2>{many(len(rows), 'event')}{more}</h2><table>{head}{''.join(rows)}</table>"
 
 
+# Above its diagram, where no axis and no curve is.
+LEGEND = {"orientation": "h", "y": 1, "yanchor": "bottom", "x": 0}
+
+
 def _layout(height: int, **more: object) -> dict[str, Any]:
     clear = "rgba(0,0,0,0)"
     return {
         "height": height, "autosize": True, "paper_bgcolor": clear, "plot_bgcolor": clear,
-        "margin": {"l": 60, "r": 12, "t": 30, "b": 40}, "legend": {"orientation": "h"},
+        "margin": {"l": 60, "r": 12, "t": 30, "b": 40}, "legend": LEGEND,
         "modebar": {"bgcolor": clear}, **more,
     }  # fmt: skip
 
@@ -343,8 +349,12 @@ def _marks(level: str, events: Sequence[Log], x: Iterable[float], y: Iterable[ob
 def _path(drawing: Drawing) -> Figure:
     rows = list(drawing.path.rows())
     data = [_curve("path", *_columns(rows)[1:])]
-    for name, row in (("start", rows[:1]), ("end", rows[-1:])):
-        data.append(_curve(name, *_columns(row)[1:], mode="markers", marker={"size": 12}))
+    # The start is a ring, so that the end of a round does not hide it.
+    for name, row, marker in (
+        ("start", rows[:1], {"size": 20, "symbol": "circle-open", "color": NEUTRAL}),
+        ("end", rows[-1:], {"size": 14, "color": GOOD}),
+    ):
+        data.append(_curve(name, *_columns(row)[1:], mode="markers", marker=marker))
     for level in ("warning", "error"):
         placed = [(log, at) for _, log, at in drawing.events if at and log.level == LEVELS[level]]
         if placed:
@@ -402,6 +412,8 @@ def _bars(bands: Mapping[str, list[Span]]) -> list[Trace]:
     return [
         {
             "type": "bar", "orientation": "h", "name": escaped(kind), "width": 0.7,
+            # A legend of all kinds would need more rows than a phone has room for.
+            "showlegend": False, "text": escaped(kind), "textposition": "inside", "textangle": 0,
             "y": [name for name, _ in rows],
             "base": [_ms(span.begin) for _, span in rows],
             "x": [1000 * (span.end - span.begin) for _, span in rows],
@@ -451,9 +463,9 @@ def _stacked(diagrams: Sequence[Diagram]) -> Figure:
         layout[f"yaxis{number}"] = {
             "title": {"text": diagram.title}, "automargin": True,
         } | diagram.axis  # fmt: skip
-        layout[f"legend{number}"] = {"orientation": "h", "y": top, "yanchor": "bottom", "x": 0}
+        layout[f"legend{number}"] = LEGEND | {"y": top}
         data += [
-            trace | {"yaxis": f"y{number}", "legend": f"legend{number}", "showlegend": True}
+            {"showlegend": True, "yaxis": f"y{number}", "legend": f"legend{number}"} | trace
             for trace in diagram.traces
             if trace["x"]
         ]

@@ -206,9 +206,6 @@ def _sources(state: RobotState) -> Table:
     return _table(("sources", "priority", "seen", "waits for"), rows, (1, 2))
 
 
-SHOWN_GAP_S = 0.25  # the default timeout of a source
-
-
 def _drives(source: SourceState, state: RobotState) -> bool:
     return source.name == state.source and state.mode == "driving" and not source.waits_for
 
@@ -219,7 +216,7 @@ def _waits(source: SourceState, state: RobotState) -> str:
         parts = ["nothing: it drives"]
     elif source.wait == "neutral" and source.linear is not None and source.angular is not None:
         parts.append(f"it sends {source.linear:.3f} m/s, {source.angular:.3f} rad/s")
-    if source.longest_gap > SHOWN_GAP_S:
+    if source.longest_gap:
         parts.append(f"usable commands up to {source.longest_gap:.1f} s apart")
     return "; ".join(parts)
 

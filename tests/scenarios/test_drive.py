@@ -17,7 +17,7 @@ from acsard.core.config.settings import (
 )
 from acsard.core.messages.schema import Beat, JointState, TFMessage
 from tests.scenarios.world import World
-from tests.wheels import FOUR, TWO, four_and_two
+from tests.wheels import FOUR, STEADY, TWO, four_and_two
 
 
 @pytest.fixture
@@ -27,7 +27,7 @@ def wheels() -> WheelMap:
 
 @pytest.fixture
 def world(wheels: WheelMap) -> World:
-    world = World(Config(mcu=McuConfig(wheels=wheels)))
+    world = World(Config(mcu=McuConfig(wheels=wheels), limits=STEADY))
     world.run(0.2)
     world.send(0.0)
     world.run(0.05)
@@ -246,6 +246,7 @@ def test_the_course_robot_drives_and_turns_with_all_its_faults() -> None:
     world = World(
         Config(
             mcu=McuConfig(wheels=TWO, trailing_comma=True, reply_period=0.1),
+            limits=STEADY,
             sim=SimConfig(faults=faults, encoder_counts=385),
         )
     )

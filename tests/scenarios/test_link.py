@@ -232,3 +232,11 @@ def test_a_board_with_other_motors_is_never_driven_and_the_advice_names_the_sett
     assert (world.state.link, world.state.code) == ("booting", code)
     assert "mcu.wheels" in world.state.reason
     assert board.vehicle.set_points == [0.0] * 4
+
+
+def test_a_board_that_answers_seldom_is_answered_with_the_setting() -> None:
+    world = World(Config(mcu=McuConfig(port="/dev/ttyUSB0")))
+    with world.mcu.fault("sparse_replies"):
+        world.run(3.0)
+    assert world.state.code == "reply_period"
+    assert "set mcu.reply_period = 0." in world.state.reason

@@ -131,7 +131,7 @@ def test_zenoh_ignores_that_the_authority_has_expired_so_no_trouble_is_reported(
     endpoint = free_tls_endpoint()
     with listening(tls / "old robot", endpoint):
         client_session(endpoint, str(tls / "old client")).close()
-        assert trouble(endpoint, str(tls / "old client")) == ""
+        assert trouble(endpoint, str(tls / "old client")) is None
 
 
 def test_a_tool_with_a_key_that_zenoh_refuses_names_the_key(tls: Path, robot: str) -> None:

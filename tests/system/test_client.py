@@ -172,7 +172,9 @@ def test_a_drive_that_is_stopped_on_its_way_raises_and_does_not_go_on(
             with pytest.raises(NotDrivenError, match="stopped"):
                 robot.drive(0.3, seconds=30.0)
             stopping.result()
-        assert robot.call("clear").success
+        robot.call("clear")
+        with pytest.raises(ReplyError, match="linear_speed"):
+            robot.set({"limits.linear_speed": -1.0})
 
 
 @pytest.mark.slow

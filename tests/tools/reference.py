@@ -9,6 +9,7 @@ import argparse
 import ast
 import html
 import inspect
+import json
 import re
 from collections.abc import Callable, Iterable, Iterator
 from itertools import pairwise
@@ -24,6 +25,7 @@ from acsard.checkup.outcomes import OUTCOMES_BY_CODE
 from acsard.cli.command_line import parser
 from acsard.core.messages.json_schema import SCHEMAS
 from acsard.core.messages.schema import BatterySummary
+from acsard.core.messages.state_warnings import BATTERY, ESTOP
 from acsard.core.ros.transports import ros_names
 from acsard.core.tables.bus_codes import BUS
 from acsard.core.tables.certificate_codes import CERTIFICATES
@@ -294,10 +296,28 @@ def codes() -> str:
     )
 
 
+def page_findings() -> str:
+    """Return what the robot's page says of each code that has a short form, for its scripts."""
+    short = {
+        code: (entry.figure, "" if "{" in entry.advice else entry.advice)
+        for code, entry in (STOPS | MOTORS | POSE | FILES).items()
+        if entry.figure and "{" not in entry.figure
+    }
+    rows = "".join(f"  {code}: {json.dumps(pair)},\n" for code, pair in short.items())
+    return (
+        "// Written by `python -m tests.tools.tables` from the tables of acsard/core/tables.\n\n"
+        "/** Maps a code to its short form, and to the advice if that needs no values. */\n"
+        f"export const FINDINGS = {{\n{rows}}};\n\n"
+        "/** Map a level of the battery, or a state of the emergency stop, to its code. */\n"
+        f"export const BATTERY = {json.dumps(BATTERY)};\n"
+        f"export const ESTOP = {json.dumps(ESTOP)};\n"
+    )
+
+
 def _said(text: str) -> str:
     # A value that follows a word without a space is a clause that may be missing.
     always = re.sub(r"(?<=[\w)}]){\w+}", "", text)
-    return _flat(re.sub(r"{(\w+)[^}]*}", lambda match: match[1].upper(), always.rstrip(" ;:")))
+    return _flat(re.sub(r"{(\w+)[^}]*}", lambda match: match[1].upper(), always))
 
 
 # the page
@@ -373,5 +393,6 @@ GENERATED: dict[str, Callable[[], str]] = {
     f"{PAGES}/codes.md": codes,
     f"{PAGES}/http.md": http,
     f"{PAGES}/promises.md": promises,
+    "acsard/web/page/findings.js": page_findings,
 }
-"""Maps each generated page to the function that writes it."""
+"""Maps each generated file to the function that writes it."""

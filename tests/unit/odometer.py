@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from acsard.core.config.settings import DriveConfig, LimitsConfig, OdometryConfig, WheelMap
+from acsard.core.config.settings import DriveConfig, OdometryConfig, WheelMap
 from acsard.core.link.feedback import Line
 from acsard.core.motion.agreement import claims
 from acsard.core.motion.consistency import ConsistencyChecks
@@ -13,7 +13,7 @@ from acsard.core.motion.kinematics import Kinematics, on_arc
 from acsard.core.motion.odometry import Odometry
 from acsard.core.motion.uncertainty import ErrorModel
 from acsard.core.values import Estimate, Pose, WheelSpeeds
-from tests.wheels import FOUR
+from tests.wheels import FOUR, STEADY
 
 MEASURED = OdometryConfig(
     wheel_separation_multiplier_std=0.0, wheel_radius_ratio_std=0.0, distance_scale_std=0.0
@@ -29,7 +29,7 @@ class Odometer:
         drive: DriveConfig = DriveConfig(),  # noqa: B008
         wheels: WheelMap = FOUR,
     ) -> None:
-        kinematics, limits = Kinematics(drive), LimitsConfig()
+        kinematics, limits = Kinematics(drive), STEADY
         self.model = ErrorModel(odometry, kinematics, counts, limits, names=wheels.names)
         self.checks = ConsistencyChecks.initial(self.model)
         self.odometry = Odometry.initial(self.model)

@@ -28,6 +28,7 @@ from acsard.core.values import (
     WheelSpeeds,
 )
 from tests.stepped import Inputs, Outputs, SteppedRobot
+from tests.wheels import STEADY
 
 MS = 1_000_000
 WALL_NS = 1_800_000_000 * NS_PER_S
@@ -52,7 +53,7 @@ class Rig:
         status: bytes = b"",
         watched: bool = False,
     ) -> None:
-        config = replace(config or Config(), feedback=FeedbackConfig(encoders=watched))
+        config = replace(config or Config(limits=STEADY), feedback=FeedbackConfig(encoders=watched))
         self.robot = Robot(config, latches)
         self.stepped = SteppedRobot(self.robot)
         self.codec = Codec(config.mcu.wheels, config.mcu.trailing_comma)

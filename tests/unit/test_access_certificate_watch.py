@@ -106,7 +106,7 @@ async def test_new_files_and_a_new_router_are_noticed_and_missing_ones_change_no
     await asyncio.sleep(0.1)
     assert known.keys() == {"", "the authority", f"the router {ROUTER}"}
     # All of the test's certificates end within 30 days, and the router's have ended.
-    assert [event.kind for event in events] == ["expires", "expired"]
+    assert [event.code for event in events] == ["certificate_expires", "certificate_expired"]
     assert "acsard tls renew" in events[1].text
     assert f"(certificate of the router {ROUTER})" in events[1].text
     task.cancel()

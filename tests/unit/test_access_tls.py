@@ -3,9 +3,13 @@
 from __future__ import annotations
 
 import errno
-import os
+import shutil
 import socket
-from collections.abc import Callable
+import ssl
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any
 
@@ -21,9 +25,11 @@ from acsard.bus.tls_files import (
     require_usable,
 )
 from acsard.bus.tls_trouble import trouble
+from acsard.core.codes import joined
 from acsard.core.config.settings import BusConfig, Config, RobotConfig
 from acsard.core.values import NS_PER_S
 from acsard.host.errors import CertificateError
+from acsard.machine import authority as making
 from acsard.machine.authority import Authority
 
 DAY_NS = 86400 * NS_PER_S
@@ -105,45 +111,111 @@ def test_the_ends_of_the_certificate_and_of_its_authority_are_read(tmp_path: Pat
 
 
 @pytest.mark.parametrize(
-    ("number", "phrase", "untold"),
+    ("error", "code", "phrase"),
     [
-        (errno.EHOSTUNREACH, "robot.local cannot be reached (No route to host)", "listens"),
-        (errno.ENETUNREACH, "robot.local cannot be reached (Network is unreachable)", "listens"),
-        (errno.ECONNREFUSED, "no program listens on port 7449 of robot.local", "not there"),
+        (OSError(errno.EHOSTUNREACH, "No route to host"), "tls_no_route", "(No route to host)"),
+        (OSError(errno.ENETUNREACH, "Network is down"), "tls_no_route", "(Network is down)"),
+        (OSError(errno.ECONNREFUSED, "refused"), "tls_no_program", "on port 7449 of robot.local"),
+        (TimeoutError(), "tls_no_answer", "does not answer on port 7449"),
+        (socket.gaierror(socket.EAI_NONAME, "unknown"), "tls_no_name", "hostname -I"),
     ],
 )
 def test_an_absent_host_is_distinguished_from_a_port_without_a_program(
-    number: int, phrase: str, untold: str, monkeypatch: pytest.MonkeyPatch
+    error: OSError, code: str, phrase: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def connection(*_: Any) -> None:
-        raise OSError(number, os.strerror(number))
+        raise error
 
     monkeypatch.setattr(socket, "create_connection", connection)
-    message = trouble("tls/robot.local:7449", "")
-    assert phrase in message
-    assert untold not in message
+    why = trouble("tls/robot.local:7449", "")
+    assert why is not None
+    assert why.code == code
+    assert phrase in joined(why).text
+
+
+@pytest.fixture(scope="module")
+def tls(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Certificates that are valid, expired, for later, for other names, and a stranger's."""
+    place = tmp_path_factory.mktemp("tls")
+    ours = Authority.make(place / "ca", "ours", 10)
+    ours.issue(place / "good", "robot", ["localhost"], 1)
+    ours.issue(place / "ended", "robot", ["localhost"], -1)
+    ours.issue(place / "elsewhere", "robot", ["robot.example"], 1)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(making, "datetime", Later)
+        ours.issue(place / "later", "robot", ["localhost"], 1)
+    Authority.make(place / "other", "other", 10).issue(place / "stranger", "x", ["localhost"], 1)
+    shutil.copytree(place / "stranger", place / "mixed")  # knows the robot's authority
+    shutil.copy(place / "good/ca.pem", place / "mixed")
+    return place
+
+
+class Later(datetime):
+    """The clock of a machine that is two days ahead."""
+
+    @classmethod
+    def now(cls, tz: object = None) -> datetime:  # type: ignore[override]
+        return datetime.now(UTC) + timedelta(days=2)
+
+
+@contextmanager
+def server(own: Path) -> Iterator[str]:
+    """Serve one TLS connection with these certificates, or what a file without them stands for."""
+
+    def serve() -> None:
+        link, _ = listener.accept()
+        with link, suppress(OSError):
+            if own.name == "closes":
+                return
+            if own.name == "speaks":
+                link.sendall(b"hello\r\n")
+            else:
+                context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+                context.load_cert_chain(own / "certificate.pem", own / "key.pem")
+                context.load_verify_locations(own / "ca.pem")
+                context.verify_mode = ssl.CERT_REQUIRED
+                link = context.wrap_socket(link, server_side=True)
+            link.recv(100)
+
+    with socket.create_server(("localhost", 0)) as listener:
+        thread = threading.Thread(target=serve)
+        thread.start()
+        yield f"tls/localhost:{listener.getsockname()[1]}"
+        thread.join()
 
 
 @pytest.mark.parametrize(
-    ("code", "reason", "phrase"),
+    ("robot", "client", "code"),
     [
-        (20, "unable to get local issuer certificate", "dir/ca.pem did not sign the certificate"),
-        (23, "certificate revoked", "the certificate of robot is not valid"),
+        ("good", "good", None),
+        ("closes", "good", "tls_closed"),
+        ("speaks", "good", "tls_not_spoken"),
+        ("ended", "good", "tls_server_expired"),
+        ("later", "good", "tls_server_early"),
+        ("elsewhere", "good", "tls_server_other_name"),
+        ("good", "stranger", "tls_server_not_signed"),
+        ("good", "mixed", "tls_own_refused"),
+        ("good", "ended", "tls_own_expired"),
     ],
 )
-def test_a_rejected_server_certificate_has_the_reason_of_openssl(
-    code: int, reason: str, phrase: str
+def test_each_trouble_of_a_connection_has_its_code(
+    tls: Path, robot: str, client: str, code: str | None
 ) -> None:
-    message = tls_trouble._server_certificate_error(code, reason, "robot", "dir")
-    assert message.startswith(("the authority in ", "the certificate of robot"))
-    assert phrase in message
-    assert f"({reason})" in message
-    assert ("did not sign" in message) is (code == 20)
+    with server(tls / robot) as endpoint:
+        why = trouble(endpoint, str(tls / client))
+    assert (why and why.code) == code
+
+
+def test_any_other_fault_of_a_certificate_has_the_reason_of_openssl() -> None:
+    why = tls_trouble._server_certificate_error(23, "certificate revoked", "robot", "dir")
+    assert why.code == "tls_server_invalid"
+    assert "the certificate of robot is not valid (certificate revoked)" in why.text
 
 
 @pytest.mark.slow
 def test_a_server_that_never_answers_the_handshake_is_reported(tmp_path: Path) -> None:
     Authority.make(tmp_path, "test", 1, ["localhost"]).issue(tmp_path, "robot", ["localhost"], 1)
     with socket.create_server(("127.0.0.1", 0)) as deaf:
-        message = trouble(f"tls/localhost:{deaf.getsockname()[1]}", str(tmp_path))
-    assert "does not answer the TLS handshake" in message
+        why = trouble(f"tls/localhost:{deaf.getsockname()[1]}", str(tmp_path))
+    assert why is not None
+    assert why.code == "tls_handshake_hangs"

@@ -13,7 +13,7 @@ from acsard.checkup.lateness import (
     MAX_PAUSE_S,
     is_doubtful,
 )
-from acsard.checkup.outcomes import TimingFinding, find
+from acsard.checkup.outcomes import Outcome, TimingFinding, find
 from acsard.core.simulator import protocol
 from tests.each import each
 from tests.unit.checkup_robots import (
@@ -154,7 +154,7 @@ def test_a_later_step_reports_a_fault_that_an_earlier_step_could_not_judge() -> 
     ],
 )  # fmt: skip
 def test_only_outcomes_that_a_late_computer_can_cause_are_doubted(
-    outcome: str, late_s: float, doubted: bool
+    outcome: Outcome, late_s: float, doubted: bool
 ) -> None:
     fields: dict[str, Any] = dict.fromkeys(
         ("figure", "seconds", "rate", "way", "gap", "quiet", "period", "lines", "here"), 1.0

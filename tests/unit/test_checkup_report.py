@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from typing import Any
+from typing import Any, get_args
 
 import pytest
 
@@ -11,10 +11,11 @@ from acsard.checkup import checkup_report, lateness
 from acsard.checkup.checkup_report import report, summary
 from acsard.checkup.findings import SKIPPED_STEPS, Finding, motor_name, wheel_of
 from acsard.checkup.motion import MAX_WATCHDOG_S
-from acsard.checkup.outcomes import OUTCOMES, OUTCOMES_BY_CODE, find
+from acsard.checkup.outcomes import OUTCOMES, OUTCOMES_BY_CODE, Outcome, find
 from acsard.core.config.contradictions import contradictions
 from acsard.core.config.settings import Config, McuConfig, WheelMap
 from acsard.core.link.link_state import WATCHDOG_S
+from acsard.core.tables.finding_table import code_of
 from tests.each import each
 from tests.unit.checkup_robots import configured
 
@@ -105,10 +106,11 @@ SEEN = {part.partition("}")[0].partition(":")[0].partition("!")[0]
         for part in OUTCOMES.split("{")[1:]}  # fmt: skip
 
 
-@each("outcome", OUTCOMES_BY_CODE)
-def test_every_outcome_has_complete_texts(outcome: str) -> None:
+@each("outcome", get_args(Outcome))
+def test_every_outcome_has_complete_texts(outcome: Outcome) -> None:
     finding = find(outcome, {"mcu.baud_rate": 9600}, **dict.fromkeys(SEEN, AnyObservation()))
-    assert (finding.code, finding.name) == (outcome, OUTCOMES_BY_CODE[outcome].subject)
+    assert f"{finding.name}: " == outcome[: len(finding.name) + 2]
+    assert finding.code == code_of(outcome)
     assert finding.keys == {"mcu.baud_rate": 9600}
     assert not {"{", "}", "  ", "->"} & {*finding.figure, *finding.text.split(" "), *finding.mend}
     if finding.verdict in ("FAIL", "WARN"):

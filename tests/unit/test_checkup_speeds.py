@@ -58,7 +58,7 @@ def test_the_speeds_up_to_that_of_the_limits_are_compared(
 ) -> None:
     robot = Reported(change, config)
     with robot.board() as board:
-        found = top_speed.finding(board, range(len(board.letters)), "", TOP, 0.05)
+        found = top_speed.finding(board, range(len(board.letters)), None, TOP, 0.05)
         assert max(map(abs, robot.mcu.vehicle.speeds)) < 0.1
         assert board.most_speed == 6.0
     assert found.code == code
@@ -100,7 +100,7 @@ def test_a_motor_that_is_backward_from_the_start_is_not_driven_faster_and_is_no_
     with robot.board() as board:
         board.wire.send(f"{board.letters[0]}n\r\n".encode())
         board.stop_motors()
-        found = top_speed.finding(board, [0, 1], "", TOP, 0.05)
+        found = top_speed.finding(board, [0, 1], None, TOP, 0.05)
     assert found.code == "top_speed_backward"
     assert "motor a" in found.text
     assert "overflow" not in found.text
@@ -111,7 +111,7 @@ def test_a_runaway_is_judged_by_the_speed_of_the_step_until_the_motors_stand() -
     robot = Reported(lambda speed: 4 * speed if speed > 15 else speed)
     with robot.board() as board:
         with pytest.raises(StoppedError) as end:
-            top_speed.finding(board, [0], "", TOP, 0.05)
+            top_speed.finding(board, [0], None, TOP, 0.05)
         assert "more than 30 rad/s" in end.value.finding.text
 
 
@@ -120,7 +120,7 @@ def test_a_restart_at_high_speed_leaves_the_high_bound_until_the_motors_stand() 
     with robot.board() as board:
         board.abort_check = lambda: resets(robot)
         with pytest.raises(RestartedError):
-            top_speed.finding(board, [0], "", TOP, 0.05)
+            top_speed.finding(board, [0], None, TOP, 0.05)
         assert board.most_speed == 1.5 * TOP
         board.abort_check = lambda: None
         board.forget()

@@ -182,6 +182,7 @@ def test_each_subcommand_is_called_by_a_test() -> None:
     tests = Path(__file__).parents[1]
     calls = "\n".join(p.read_text() for p in (tests / "unit/words/transcripts").glob("*.txt"))
     sources = "\n".join(p.read_text() for p in tests.rglob("*.py"))
-    assert not [
+    untried = [
         verb for verb in VERBS if f"$ acsard {verb}" not in calls and f'"{verb}"' not in sources
     ]
+    assert not untried, f"write a transcript in tests/unit/words/transcripts, or a test: {untried}"

@@ -16,7 +16,7 @@ from msgspec import structs
 from acsard import client
 from acsard.client import AcsardError, Client, NoAnswerError, asynchronous, driving
 from acsard.client.asynchronous import AsyncClient
-from acsard.client.connection import MIN_SPACING_S, Connection
+from acsard.client.connection import MIN_SPACING_S, Connection, accepted
 from acsard.client.driving import UnheardError
 from acsard.client.identity import ClientIdentity
 from acsard.core.config.settings import Config, DriveConfig
@@ -255,6 +255,8 @@ def test_a_call_above_the_size_limit_is_refused_in_the_daemon_s_words(
     refusal = Decoder(schema.ServiceReply).decode(reply.encoding, reply.payload)
     assert refusal.message.startswith("the payload has over 4096 bytes")
     assert client_of(session).set(larger) == refusal
+    with pytest.raises(ReplyError, match="the payload has over 4096 bytes"):
+        accepted(refusal)
     with pytest.raises(NoAnswerError):  # a stop is sent whatever its size
         client_of(session).request("stop", {"why": "x" * (MAX_COMMAND_BYTES + 1)})
 

@@ -25,6 +25,7 @@ from acsard.host import real_time
 from acsard.host.errors import CertificateError, NoAnswerError
 from acsard.host.kernel_counters import Kernel
 from acsard.machine import examination, versions
+from acsard.machine.authority import Authority
 from acsard.machine.examination import Running, clocks, compared, examine, reported, routers
 from acsard.machine.finding import Finding
 from acsard.machine.local_findings import scheduling, serial_port, slowness, unused_version
@@ -61,6 +62,25 @@ def test_a_reason_of_two_reports_is_printed_once_where_it_is_not_ok() -> None:
 def test_each_remedy_is_said_once() -> None:
     text = b"[mcu]\nbaud_rate = 1\nreply_period = -1"
     assert [finding.mend for finding in examine("x", text, {})] == [SETTINGS, ""]
+
+
+@pytest.mark.parametrize(
+    ("text", "wanted"),
+    [
+        ('listen = ["tcp/127.0.0.1:9"]\n[mcu]\nport = "TLS/key.pem"',
+         "daemon_absent port_not_serial"),
+        ('listen = ["tcp/127.0.0.1:9", "tls/0.0.0.0:9"]\ntls = "TLS"',
+         "configuration_doubtful gateway_absent"),
+        ('mode = "client"\nconnect = ["tcp/127.0.0.1:9"]', "daemon_behind_router router_absent"),
+    ],
+)  # fmt: skip
+def test_what_does_not_answer_has_its_code(
+    text: str, wanted: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(examination, "computer", lambda *_: ())  # of the machine of the tests
+    Authority.make(tmp_path, "test", 60).issue(tmp_path, "robot", ["localhost"], 60)
+    text = f"[bus]\n{text}\n".replace("TLS", str(tmp_path))
+    assert {found.code for found in examine("robot.toml", text.encode(), {})} >= {*wanted.split()}
 
 
 def test_the_file_s_values_are_ok() -> None:

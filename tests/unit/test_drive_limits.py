@@ -15,6 +15,7 @@ from acsard.core.motion.kinematics import Kinematics
 from acsard.core.motion.limits import coast, follow
 from acsard.core.values import AT_REST, REST, Twist
 from tests.each import each
+from tests.wheels import STEADY
 
 law = settings(max_examples=100)
 Pair = tuple[float, float]
@@ -31,9 +32,9 @@ def pair(twist: Twist) -> Pair:
 DT = 0.01
 EPS = 1e-9
 KINEMATICS = Kinematics(DriveConfig())
-FREE = LimitsConfig(wheel_speed=99.99)
-"""Default limits with wheels that never saturate: (1 + 4 x 0.15) / 0.05 = 32 rad/s."""
-JERKY = LimitsConfig(linear_jerk=5.0, angular_jerk=20.0, wheel_speed=99.99)
+FREE = replace(STEADY, wheel_speed=99.99)
+"""Limits with wheels that never saturate: (1 + 4 x 0.15) / 0.05 = 32 rad/s."""
+JERKY = replace(FREE, linear_jerk=5.0, angular_jerk=20.0)
 UNEVEN = LimitsConfig(
     linear_speed=2.0,
     linear_acceleration=0.5,

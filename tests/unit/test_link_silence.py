@@ -53,6 +53,7 @@ HEARD: dict[str, tuple[bytes, str, str]] = {
     ),
     "another form": (b"ap 0.00,bp 0.00,cp 0.00,dp 0.00\r\n", "form", "none good"),
     "two other motors": (b"rp12.50,lp08.75,\r\n", "letters", "none good"),
+    "a board of two": (b"ap12.50,bn08.75\r\n", "letters", "none good"),
     "four other motors": (b"ep00.00,fp00.00,gp00.00,hp00.00#07*0000\r\n", "letters", "none good"),
     "a motor twice": (b"ap00.00,ap00.00,bp00.00,dp00.00\r\n", "letters", "none good"),
     "three values": (b"ap00.00,bp00.00,cp00.00\r\n" * 4, "cut", "none good"),
@@ -116,6 +117,7 @@ def test_the_diagnosis_says_what_was_received_and_how_it_looks(
 @each(
     ("heard", "remedy"),
     [
+        ("a board of two", 'write right = "+a", left = "+b" into [mcu.wheels]'),
         ("two other motors", 'write left = "+l", right = "+r" into [mcu.wheels]'),
         (
             "four other motors",

@@ -114,7 +114,7 @@ FACTS: list[tuple[str, Any]] = [
     ("still({ ...stopped, link: 'down' }, 'teleop', 'me')",
      "Stopped. Press Release STOP first. The board is missing, too."),
     ("still({ ...stopped, emergency_stop: 'pressed' }, 'teleop', 'me')",
-     "Emergency stop: release it at the robot first."),
+     "Emergency stop pressed: release it at the robot first."),
     ("driving(driven('nav', ''), 'teleop', 'me')", "nav"),
     # A push of the stick: an unknown turn of a robot that may only turn is slow.
     ("twist(0.05, 0.05, 0.2, { linear: 1, angular: 4 })", [0, 0]),

@@ -28,7 +28,7 @@ from acsard.core.ros.channels import BY_KEY, CMD_VEL_IN, LOG_CHANNEL
 from acsard.core.ros.shapes import LEVELS, Log, command_message
 from acsard.core.values import NS_PER_S, Twist
 from acsard.recording.file import Recording
-from acsard.recording.html_report import MAX_EVENTS, MAX_ROWS, Drawing, Rows, page
+from acsard.recording.html_report import COLOURS, MAX_EVENTS, MAX_ROWS, Drawing, Rows, page
 from acsard.recording.published import Published, published
 from tests.scenarios.taped import Tape, two_drivers
 from tests.scenarios.world import World
@@ -260,6 +260,20 @@ def test_the_bands_say_who_drives_and_why_another_waits() -> None:
     assert "teleop has priority" in texts["nav"].replace("<br>", " ")
     modes = {t["name"] for t in pictures(text)["time"]["data"] if "mode" in t["y"]}
     assert modes >= {"driving", "stopped"}
+
+
+def test_a_phone_has_room_for_the_words_and_a_round_shows_its_start() -> None:
+    text = report(drive_of_two(), "acsar", [])
+    for kind in ("driving", "stopped", "drives", "waits"):
+        for bar in traces(text, kind):
+            assert (bar["text"], bar["showlegend"]) == (kind, False)
+    path = pictures(text)["path"]["layout"]
+    assert path["legend"]["y"] == 1  # above the picture: its axis is below
+    ring, end = traces(text, "start")[0]["marker"], traces(text, "end")[0]["marker"]
+    assert ring["size"] > end["size"]
+    assert ring["symbol"].endswith("-open")
+    orange = COLOURS["warning"]
+    assert orange not in (ring["color"], end["color"], COLOURS["waiting"], COLOURS["booting"])
 
 
 def test_a_command_far_out_of_range_does_not_flatten_the_other_curves() -> None:

@@ -151,10 +151,13 @@ def test_the_ros_state_has_the_values_of_the_native_state() -> None:
     # An exported recording does not contain the configuration file, and the robot that a replay
     # makes knows no speed limit, only the setting that it lowers. The battery has its own topic. An
     # export has the version in its metadata.
-    assert left_out == {
+    wanted = {
         "stamp", "latencies", "encoder_counts", "causes", "latch_file_error", "settings_differ",
         "speed_limit", "battery", "certificate_days", "certificate", "version",
     }  # fmt: skip
+    assert left_out == wanted, (
+        f"add {left_out ^ wanted} to the state of ROS in core/ros, or to this list"
+    )
 
 
 def test_null_fields_of_the_state_are_nan_in_ros() -> None:

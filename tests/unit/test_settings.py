@@ -108,7 +108,8 @@ def test_every_number_is_accepted_up_to_its_bounds_and_no_further(key: Key) -> N
 
 def test_the_reference_file_has_every_key_and_no_other_and_explains_each_table() -> None:
     text = REFERENCE.read_text(encoding="utf-8")
-    assert not differences(parse(text.encode()), Config()), "the file, the defaults"
+    differ = differences(parse(text.encode()), Config())
+    assert not differ, f"acsard.toml (its) and core/config/settings.py (ours) differ: {differ}"
     assert parse(b"") == Config()
     table = tomllib.loads(text)
     for source in table["commands"]["sources"]:

@@ -52,7 +52,10 @@ class GyroFollower:
             changed = self._follow((sender, "" if self._own else frame), arrival.arrived_ns)
         except DecodeError as error:
             counters[f"imu_{error.reason}"] = counters.get(f"imu_{error.reason}", 0) + 1
-            events.append(Event("imu_refused", str(error), "warning", kind=error.reason))
+            why = str(error)
+            events.append(
+                Event("imu_refused", why, "warning", kind=error.reason, code=error.reason)
+            )
             return None
         return replace(sample, anew=True) if changed else sample
 

@@ -19,7 +19,7 @@ from acsard.core.link.link_setup import LinkSetup
 from acsard.core.link.link_state import Link, LinkState
 from acsard.core.link.step_times import StepTimes
 from acsard.core.tables.link_codes import ReceivedCode
-from acsard.core.values import NS_PER_S, TWO_WHEELS, WHEELS, Event, Ns
+from acsard.core.values import NS_PER_S, TWO_WHEELS, WHEELS, Event, Ns, wheel_names
 
 BUSY_ADVICE = CODES["host_late"].advice
 
@@ -185,7 +185,10 @@ class Traffic(Struct):
             return ""
         if len({*motors}) < len(motors):
             return "the firmware must name each motor once"
-        names = WHEELS if len(motors) == len(WHEELS) else TWO_WHEELS[::-1]
+        # Motor a is on the right, as the sketch and the wiring have it, but l and r name a side.
+        names = wheel_names(len(motors))
+        if {*motors} == {"l", "r"}:
+            names = names[::-1]
         entries = [f'{name} = "+{motor}"' for name, motor in zip(names, motors, strict=False)]
         if names == WHEELS:
             entries += [f'{name} = ""' for name in TWO_WHEELS]

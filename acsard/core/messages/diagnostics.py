@@ -106,7 +106,7 @@ class Row(Struct, frozen=True):
         return DiagnosticStatus(
             LEVELS.index(worst.level),
             f"acsard: {self.name}",
-            "; ".join(why.text.rstrip(";:") for why in self.findings),
+            "; ".join(why.text for why in self.findings),
             robot_id,
             [KeyValue(key, value) for key, value in values.items()],
         )

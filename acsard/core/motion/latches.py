@@ -63,15 +63,15 @@ def describe(cause: Cause) -> str:
     when = f"at {utc(cause.at_ns)}{', before the restart' if cause.kept else ''}"
     if _asked_for(cause):
         return f"{'was ' if cause.kept else ''}{cause.text} {when}"
-    return f"{_alone(cause)} (latched {when})"
+    return f"{cause.text} (latched {when})"
 
 
 def in_force(causes: Sequence[Cause]) -> str:
     """Return what holds the robot, for "the robot is still ..."."""
-    faults = [_alone(cause) for cause in causes if cause.kind == "fault"]
+    faults = [cause.text for cause in causes if cause.kind == "fault"]
     texts = [f"in fault ({'; also '.join(faults)})"] if faults else []
     texts += [
-        cause.text if _asked_for(cause) else f"stopped ({_alone(cause)})"
+        cause.text if _asked_for(cause) else f"stopped ({cause.text})"
         for cause in causes
         if cause.kind != "fault"
     ]
@@ -82,10 +82,6 @@ def _equal(one: Cause, other: Cause) -> bool:
     if one.kind == other.kind == "inactive":
         return True
     return (one.kind, one.code, one.part, one.by) == (other.kind, other.code, other.part, other.by)
-
-
-def _alone(cause: Cause) -> str:
-    return cause.text.rstrip(":")  # without the advice that may follow
 
 
 def _asked_for(cause: Cause) -> bool:

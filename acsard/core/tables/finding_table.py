@@ -2,7 +2,8 @@
 
 An entry begins with `LEVEL code`, or with `LEVEL subject: outcome` for the code `subject_outcome`,
 and maybe ` | figure`: a few words for a column, or the measured values. Its text follows, and
-behind `->` the advice: what a person can do. All three are format strings.
+behind `->` the advice: what a person can do. All three are format strings. A text may end with ":",
+which then stands between text and advice where both make one sentence; otherwise ";" does.
 """
 
 from __future__ import annotations
@@ -34,6 +35,7 @@ class Entry(Struct, frozen=True):
     subject: str
     figure: str
     text: str
+    joint: str
     advice: str
 
 
@@ -43,7 +45,7 @@ def code_of(name: str) -> str:
 
 
 def table(codes: object, text: str) -> dict[str, Entry]:
-    """Return the entries by code. `codes` is their `Literal`, or None. Raises `ValueError`."""
+    """Return the entries by code. `codes` is the `Literal` of their names. Raises `ValueError`."""
     entries = {}
     for entry in re.split(r"\n+(?! )", text.strip()):
         head, *rest = entry.splitlines()
@@ -51,10 +53,11 @@ def table(codes: object, text: str) -> dict[str, Entry]:
         name, _, figure = head.partition(" | ")
         subject = name.partition(":")[0]
         words, _, advice = " ".join(line.strip() for line in rest).partition("-> ")
-        level = _LEVEL_OF[mark.rstrip("?")]
+        text, mark, unsure = words.strip(), mark.rstrip("?"), mark.endswith("?")
         entries[code_of(name)] = Entry(
-            level, mark.rstrip("?"), mark.endswith("?"), subject, figure, words.strip(), advice
-        )
-    if codes is not None and (wrong := set(get_args(codes)) ^ entries.keys()):
-        raise ValueError(f"of these, a type or a table of codes lacks: {sorted(wrong)}")
+            _LEVEL_OF[mark], mark, unsure, subject, figure,
+            text.removesuffix(":"), ":" if text.endswith(":") else ";", advice,
+        )  # fmt: skip
+    if wrong := set(map(code_of, get_args(codes))) ^ entries.keys():
+        raise ValueError(f"only in the type or only in the table of its file: {sorted(wrong)}")
     return entries

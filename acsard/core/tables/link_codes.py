@@ -65,11 +65,11 @@ FAIL port_blocked
     -> unplug the adapter and plug it in again
 FAIL echo
     the daemon's own lines come back: TX and RX are connected to each other, or a terminal or the
-    RS-485 adapter echoes;
+    RS-485 adapter echoes
     -> remove the cause, then unplug the board and plug it in again
 FAIL set_points
     the board reports the commanded speeds instead of the measured ones, so nothing would show a
-    wheel that does not turn;
+    wheel that does not turn
     -> let the firmware report the speeds of the encoders, or write feedback.encoders = false if the
     robot has none; then start the daemon again
 FAIL no_checksum
@@ -81,66 +81,66 @@ FAIL replies_damaged
     -> check cable and ground
 FAIL lines_too_rare
     the microcontroller sends a line only every {interval} s, and no value of mcu.reply_period
-    allows that;
+    allows that
     -> firmware that reports by its own clock must send a line at least every {longest:g} s
 FAIL reply_period
-    the microcontroller's lines come {interval} s apart;
+    the microcontroller's lines come {interval} s apart
     -> if it reports by its own clock, set mcu.reply_period = {interval}
 FAIL received_nothing | nothing received
-    no link to the microcontroller: {received};
+    no link to the microcontroller: {received}
     -> does the board have power, is mcu.port its port (`acsard ports`), is mcu.baud_rate right,
     does mcu.wheels name its motors, are TX and RX swapped, does another program read the port
     (`acsard doctor`){firmware}?
 FAIL received_statuses | only status lines
-    no link to the microcontroller: {received};
+    no link to the microcontroller: {received}
     -> the board hears nothing: connect TX of this computer to RX of the board
 FAIL received_text | text instead of replies
-    no link to the microcontroller: {received};
+    no link to the microcontroller: {received}
     -> is mcu.port the port of the board (`acsard ports`)? Then its firmware prints other text:
     remove its Serial.print or debug output, and let it answer each line with a reply such as
     `ap00.00,bp00.00,cp00.00,dp00.00`, with the letters of mcu.wheels
 FAIL received_form | replies in another form
-    no link to the microcontroller: {received};
+    no link to the microcontroller: {received}
     -> the lines are whole, but in another form: the firmware must send
     `ap00.00,bp00.00,cp00.00,dp00.00` with the letters of mcu.wheels, p or n as the sign, and two
     digits, a point and two digits in each figure, without spaces
 FAIL received_letters | other motors
-    no link to the microcontroller: {received};
+    no link to the microcontroller: {received}
     -> the lines are whole, but do not name each motor of mcu.wheels once: {wheels}; `acsard mcu
     check` then finds out which motor turns which wheel
 FAIL received_cut | pieces of lines
-    no link to the microcontroller: {received};
+    no link to the microcontroller: {received}
     -> the firmware must send all values and Serial.println() in one reply: does it cut its replies
     short or omit the line end, is its send buffer too small, does it restart while it writes?
 FAIL received_foreign | other bytes in the lines
-    no link to the microcontroller: {received};
+    no link to the microcontroller: {received}
     -> is it a debug print of the firmware, or does a second program write to this port? If it is
     neither, it is noise: use one ground for board and computer, and a short cable away from the
     motors' leads
 FAIL received_garbage | only garbage
-    no link to the microcontroller: {received};
+    no link to the microcontroller: {received}
     -> is mcu.baud_rate the baud rate of the board, and mcu.port its port (`acsard ports`)? Does it
     send at TTL level and not RS-232, and is its ground connected to the computer's?
 FAIL received_brownout | the board starts again and again
-    the microcontroller starts again and again, because its supply voltage is too low: {received};
+    the microcontroller starts again and again, because its supply voltage is too low: {received}
     -> give the board a supply of its own or a thicker cable: starting motors pull down the voltage
 FAIL received_boot | the board starts again and again
-    the microcontroller starts again and again: {received};
+    the microcontroller starts again and again: {received}
     -> does its supply break down when motors start, or does an error in its firmware restart it?
 FAIL received_nmea | another device
-    no link to the microcontroller: {received}; this is what a GPS receiver sends;
+    no link to the microcontroller: {received}; this is what a GPS receiver sends
     -> write the port of the board into mcu.port: `acsard ports` lists all
 FAIL received_identity | a name, but no replies
-    no link to the microcontroller: {received};
+    no link to the microcontroller: {received}
     -> acsard's firmware is there, but answers no line. Does mcu.wheels name as many motors as it
     has (the sketch of a Nano, an Uno, an ESP32 or a Pico has two: right = "+a", left = "+b"), is TX
     of this computer connected to RX of the board{firmware}?
 FAIL received_few | few good lines
-    no link to the microcontroller: {received};
+    no link to the microcontroller: {received}
     -> use a short cable away from the motors' leads, a common ground, or a lower baud rate at both
     ends
 FAIL received_sparse | good lines, but too seldom
-    no link to the microcontroller: {received};
+    no link to the microcontroller: {received}
     -> the board must answer each line, or report by its own clock (then set mcu.reply_period to the
     seconds between its lines) at least every 0.25 s; does delay() or a slow print block its loop?
 WARN lines_unanswered

@@ -30,9 +30,12 @@ MOTORS = table(
     """
 FAIL driver_fault
     the board reports a fault of a motor driver
-    -> repair the driver, or switch the robot off and on
+    -> let the driver cool, and check its supply, and its motor for a short circuit or a blocked
+    wheel; then switch the robot off and on, and type `acsard call clear`
 FAIL impossible_speeds
     the board reports impossible speeds ({cause})
+    -> check the encoder of this wheel, its leads, and the counts per turn in the firmware; if the
+    wheel really turns so fast, raise feedback.wheel_speed. Then type `acsard call clear`
 FAIL wheel_reversed
     {wheel} wheel does not obey its command: it turns the wrong way {figures}:
     -> check the leads of its motor, the wires A and B of its encoder (an encoder with one channel
@@ -68,21 +71,33 @@ WARN wheel_fast
 FAIL guard_line_damaged
     the daemon's guard replaced a line for the board with zeros: the line is not complete, or does
     not have the speed of each wheel
+    -> this is a defect of acsard: keep the recording of this moment (`acsard recording`) and report
+    it; then type `acsard call clear`
 FAIL guard_too_fast
     the daemon's guard replaced a line for the board with zeros: the line moves a wheel faster than
     limits.wheel_speed
+    -> this is a defect of acsard: keep the recording of this moment (`acsard recording`) and report
+    it; then type `acsard call clear`
 FAIL guard_no_link
     the daemon's guard replaced a line for the board with zeros: the line moves a wheel while the
     serial link is not up
+    -> this is a defect of acsard: keep the recording of this moment (`acsard recording`) and report
+    it; then type `acsard call clear`
 FAIL guard_no_checksum
     the daemon's guard replaced a line for the board with zeros: the line moves a wheel without the
     checksum that mcu.link_check requires
+    -> this is a defect of acsard: keep the recording of this moment (`acsard recording`) and report
+    it; then type `acsard call clear`
 FAIL guard_no_command
     the daemon's guard replaced a line for the board with zeros: the line speeds up a wheel although
     no command is fresh, or although the mode is not driving
+    -> this is a defect of acsard: keep the recording of this moment (`acsard recording`) and report
+    it; then type `acsard call clear`
 FAIL guard_too_long
     the daemon's guard replaced a line for the board with zeros: the line still moves a wheel
     although the longest ramp to zero has ended
+    -> this is a defect of acsard: keep the recording of this moment (`acsard recording`) and report
+    it; then type `acsard call clear`
 OK wheels_obey
     every wheel obeys its command
 WARN wheel_fault | wheel fault

@@ -29,7 +29,7 @@ OK commanded
     commanded by {source}
 WARN limits_zero
     commanded by {source}, but the robot cannot move: limits.linear_speed and limits.angular_speed
-    are 0;
+    are 0
     -> set a higher limit
 OK no_command
     waiting for a command: no source has sent a usable one within its timeout
@@ -39,27 +39,30 @@ OK nothing
 OK command
     a command
 WARN no_echo
-    a command of {source} has no echo although its sender has echoed before;
+    a command of {source} has no echo although its sender has echoed before
     -> copy the newest message of the key beat into each command
 WARN other_run
-    commands of {source} echo a beat of another run of the daemon;
+    commands of {source} echo a beat of another run of the daemon
     -> copy the newest message of the key beat into each command
 WARN from_future
-    commands of {source} echo a beat that the daemon has not published yet;
+    commands of {source} echo a beat that the daemon has not published yet
     -> copy the message of the key beat unchanged
 WARN too_old
     a command of {source} came {note} s after the beat that it echoes, but at most {seconds:g} s
     count: the network delays it
+    -> if this goes on, check the network between the program and the robot (`ping`), or raise the
+    timeout of the source in commands.sources
 WARN round_trip
-    the round trip to {source} takes {note} s, but its timeout allows at most {seconds:g} s;
+    the round trip to {source} takes {note} s, but its timeout allows at most {seconds:g} s
     -> echo the newest beat, not an old one; if the network is as slow, raise the timeout of the
     source in commands.sources
 WARN not_newer
     a command of {source} is not newer than the last accepted one of its sender: the network
     repeated or swapped commands, or the sender's stamps or numbers do not rise
+    -> let only one program use a sender id, and let it number its commands upward
 WARN copied
     a command of {source} is refused, because two programs send with this sender id: their numbers
-    fall and come back;
+    fall and come back
     -> give each program a sender id of its own, and choose it anew at each start
 OK unproven
     {source} is new: the robot follows it when the delays of its commands have not fallen for
@@ -69,25 +72,26 @@ OK early
     this has lasted for {seconds:g} s
 WARN stale
     commands of {source} arrive more than {seconds:g} s later than its earliest ones, by their
-    stamps: the network delays them;
+    stamps: the network delays them
     -> if this goes on, check the network
 WARN set_back
     commands of {source} arrive {seconds:g} s later than its earliest ones, by their stamps: its
     computer's clock was slewed or set back by as much, or they wait in a queue, and stamps do not
-    show which;
+    show which
     -> did the clock change (`chronyc tracking` or `timedatectl` there)? Then restart the sender or
     type `acsard call activate`. Otherwise look for the queue, or for another program on this key
     whose clock is ahead: without a `sender` they share one
 WARN stamps
-    the stamps of {source} do not advance with time ({note});
+    the stamps of {source} do not advance with time ({note})
     -> is use_sim_time on, or are the stamps copied from another message? Send the time of the
     command, or no stamp
 WARN too_many_clocks
     a new sender of {source} is refused, because the commands of {note} others came too late, which
-    the daemon remembers for an hour;
+    the daemon remembers for an hour
     -> check their network, or type `acsard call activate`, which forgets them
 WARN stalled
     the daemon stalled: waiting for the next command of {source}
+    -> if this goes on, `acsard doctor` looks for what keeps this computer busy
 OK neutral
     send a zero first: {source} must send a zero{alone} before it can drive{lasts}{ros}
 OK zeros
@@ -100,8 +104,11 @@ OK equal
     -> wait until it is silent
 WARN senders
     {others} of this source must wait until the sender that drives falls silent
+    -> end all but one of these programs, or give each its own source
 WARN refused
     refused: {refused}
+    -> correct the program that sends it: `acsard echo events` has each refusal with its reason and
+    its sender
 WARN command_gaps
     usable commands of {source} came up to {seconds:.1f} s apart, but count for {timeout:g} s: the
     robot braked in between

@@ -33,6 +33,7 @@ OK switched_off
     -> type `acsard call activate`
 WARN other_version
     {cause} ({named})
+    -> another version of acsard stopped the robot: look at the robot, and type `acsard call clear`
 WARN stopped
     stopped by {by}
     -> look at the robot, and type `acsard call clear`
@@ -51,7 +52,7 @@ FAIL emergency_stop_silent | emergency stop not reported
 FAIL emergency_stop_missing
     safety.estop = "required", but the microcontroller has not reported an emergency-stop input:
     -> does its firmware send status lines with `estop=`?
-WARN bumper
+WARN bumper | bumper pressed
     {bumpers}
     -> release it at the robot
 FAIL bumpers_silent

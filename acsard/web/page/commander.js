@@ -6,6 +6,7 @@
 // zero (`drive.js` repeats it once), then nothing. A hold that ended by itself needs a new press, so a finger
 // that was left on the stick never drives again by accident.
 
+import { BATTERY, ESTOP, FINDINGS } from "./findings.js";
 import { person } from "./words.js";
 
 const PERIOD = 50;
@@ -29,18 +30,16 @@ const BARS = {
   shutdown: "The robot's daemon is ending.",
 };
 
-/** Maps a state of the emergency stop at the robot that counts as pressed to the remedy. */
-const PRESSED = {
-  pressed: "Emergency stop: release it at the robot first.",
-  silent: "Emergency stop silent: check the board first.",
-};
-
-/** Return what must end at the robot before a stop can be released, in words, or undefined. */
+/** Return what must end at the robot before a stop can be released, in the words of its code, or undefined. */
 function held(state) {
-  if (PRESSED[state.emergency_stop]) return PRESSED[state.emergency_stop];
   const caused = (code) => state.causes.some((cause) => cause.code === code);
-  if (caused("bumper") && state.bumpers?.some(Boolean)) return "Bumper pressed: free the robot first.";
-  return caused("battery_empty") && state.battery?.level === "stop" ? "Battery empty: charge it first." : undefined;
+  const code =
+    ESTOP[state.emergency_stop] ??
+    ((caused("bumper") && state.bumpers?.some(Boolean) && "bumper") ||
+      (caused("battery_empty") && BATTERY[state.battery?.level] === "battery_empty" && "battery_empty"));
+  if (!code) return undefined;
+  const [brief, advice] = FINDINGS[code];
+  return `${brief[0].toUpperCase()}${brief.slice(1)}: ${advice || FINDINGS.battery_low[1]} first.`;
 }
 
 /** Return whether the link to the board is up. While it is down, nobody can stop the motors from here. */
@@ -147,8 +146,12 @@ export function twist(x, y, limit, limits) {
   const far = Math.hypot(x, y);
   if (far < 0.08) return [0, 0];
   const scale = far > 1 ? 1 / far : 1;
+  return [y * scale * limit, -x * scale * turning(limit, limits)];
+}
+
+/** Return the highest turn rate of the stick at a highest speed, rad/s. */
+export function turning(limit, limits) {
   // A robot that can only turn has a linear limit of 0.
   const share = limits.linear > 0 ? limit / limits.linear : 0;
-  const turn = Math.min(limits.angular, Math.max(0.4, limits.angular * share));
-  return [y * scale * limit, -x * scale * turn];
+  return Math.min(limits.angular, Math.max(0.4, limits.angular * share));
 }

@@ -3,7 +3,7 @@
 import { barred, invited, permit, refusal, request } from "./access.js";
 import { Camera } from "./camera.js";
 import { Drive, SOURCE } from "./drive.js";
-import { boarded, driving, still } from "./commander.js";
+import { boarded, driving, still, turning } from "./commander.js";
 import { Link } from "./link.js";
 import { PathMap } from "./map.js";
 import { Minute } from "./plots.js";
@@ -150,7 +150,7 @@ async function configured() {
 
 function limited() {
   drive.limit = Number($("limit").value);
-  $("most").textContent = `${drive.limit.toFixed(2)} m/s`;
+  $("most").textContent = `${drive.limit.toFixed(2)} m/s · ${turning(drive.limit, drive.limits).toFixed(1)} rad/s`;
 }
 
 /** Return for how long a state counts as fresh, ms. This time grows with the interval between two states. */

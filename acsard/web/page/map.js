@@ -152,8 +152,11 @@ export class PathMap {
     if (this.#truth) {
       paper.strokeStyle = look("--truth");
       paper.beginPath();
-      paper.arc(...at(...this.#truth), 5, 0, 7);
+      const [right, down] = at(...this.#truth);
+      paper.arc(right, down, 5, 0, 7);
       paper.stroke();
+      paper.fillStyle = look("--truth");
+      paper.fillText("true place", right + 8, down + 16);
     }
     if (this.#pose) robot(paper, at(this.#pose.x, this.#pose.y), this.#pose.yaw + angle, Math.max(9, 0.2 * this.#zoom), look(this.#lost ? "--quiet" : "--accent"));
   }

@@ -1,14 +1,10 @@
 // Fills the views from the messages of the bus. Text is inserted as text, never as HTML.
 
 import { boarded } from "./commander.js";
+import { BATTERY, FINDINGS } from "./findings.js";
 import { RELEASE, age, ago, began, clock, lasted, person, reason, signed } from "./words.js";
 
 const DOUBTFUL = "STOP may not reach the robot from here: use its own switch.";
-const BATTERY = {
-  warning: "The battery is low.",
-  stop: "The battery is empty.",
-  unknown: "The level of the battery is unknown.",
-};
 const LEVELS = ["", "warning", "error", "warning"];
 
 export const $ = (id) => document.getElementById(id);
@@ -96,15 +92,22 @@ export function banner(state, locked, own) {
   const others = state.mode === "inactive" ? "an operator switches it on" : "an operator releases it";
   text("reason", reason(state, own) + (locked && RELEASE[state.mode] ? `; ${others}` : ""));
   const warned = [
-    alone ? "Nobody can stop the motors from here: use the robot's own switch." : "",
-    BATTERY[state.battery?.level] ?? "", pressed(state.bumpers),
-    state.wheel_fault, state.recording_error, state.latch_file_error,
+    alone ? "Nobody can stop the motors from here: use the robot's own switch" : "",
+    brief(BATTERY[state.battery?.level]), pressed(state.bumpers), brief(state.pose_doubt),
+    brief(state.wheel_fault && "wheel_fault", state.wheel_fault),
+    brief(state.recording_error && "recording_fails", state.recording_error),
+    brief(state.latch_file_error && "latch_file_fails", state.latch_file_error),
     ["valid", ""].includes(state.certificate) ? "" : `certificate ${state.certificate_expiry}`,
   ];
   text("doubt", warned.filter(Boolean).join("; "));
   powered(state.battery);
   $("estop").hidden = !["pressed", "silent"].includes(state.emergency_stop);
   document.body.classList.toggle("boardless", alone);
+}
+
+/** Return the short form of a code with its details, "" without a code, and a code of a later version as it is. */
+function brief(code, details = "") {
+  return code ? [FINDINGS[code]?.[0] ?? code, details].filter(Boolean).join(": ") : "";
 }
 
 /** Return which bumpers are pressed, in words, or "". */

@@ -42,6 +42,7 @@ void feed() { feedLoopWDT(); }
 void guard() { rp2040.wdt_begin(120); }
 void feed() { rp2040.wdt_reset(); }
 #else
+#warning "No hardware watchdog is known for this board: motors run on if its program hangs. Write guard() and feed() for it."
 void guard() {}
 void feed() {}
 #endif
