@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 
+from acsard.core.values import NS_PER_S
 from acsard.host.kernel_counters import Conditions, Kernel, Reading, SlowClock, slow_clock
 from acsard.machine import local_findings
 from tests.unit.kernel_files import COOLER, COUNT, FIRMWARE, HWMON, POLICY, QUIET, write
@@ -63,6 +64,24 @@ def test_a_clock_is_slow_if_its_limit_is_far_below_the_full_clock(
     }
     result = slow_clock(policy)
     assert result == (None if limit is None else SlowClock(governor, limit, 1500))
+
+
+@pytest.mark.parametrize(
+    ("later", "taken"),
+    # In ticks of 10 ms: of each processor for the host of the virtual machine, since its start.
+    [((18419, 19567), False), ((18421, 19567), False), ((18419, 19578), True), ((18430,), True)],
+)
+def test_a_host_that_takes_a_processor_of_the_virtual_machine_is_named(
+    later: tuple[int, ...], taken: bool, tmp_path: Path
+) -> None:
+    kernel = Kernel(write(tmp_path, QUIET))
+    before = kernel.read()
+    rows = [
+        f"cpu{n} 4563760 1967646 673613 1415998 7026 0 17675 {k} 0 0" for n, k in enumerate(later)
+    ]
+    write(tmp_path, {"proc/stat": "\n".join(["cpu  0 0 0 0 0 0 0 0 0 0", *rows])})
+    causes = local_findings.slowdowns(before, kernel.read(), 2 * NS_PER_S)
+    assert [cause.code for cause in causes] == ["computer_steal"] * taken
 
 
 @pytest.mark.parametrize("ruled", [False, True])

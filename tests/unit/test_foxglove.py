@@ -25,6 +25,7 @@ from acsard.core.values import NS_PER_S
 from acsard.foxglove import bridge as module
 from acsard.foxglove.bridge import Bridge
 from acsard.foxglove.relay import EventDeduplicator
+from acsard.foxglove.server import ShownTopics
 from acsard.host import clock
 from acsard.host.errors import ReplyError
 from tests.each import each
@@ -117,8 +118,10 @@ def test_the_log_has_a_viewer_s_call_under_a_readable_name(
     assert name == "alice@laptop acsard foxglove"
 
 
-@each("key", ["diagnostics", "tf_static", "state"])
-def test_a_late_viewer_gets_the_last_message_of_a_rare_key(world: World, key: str) -> None:
+@each(("key", "again"), [("diagnostics", 1), ("tf_static", 1), ("state", 1), ("odom", 0)])
+def test_a_late_viewer_gets_the_last_message_of_a_rare_key(
+    world: World, key: str, again: int
+) -> None:
     relay = world.bridge._relay
     logged: list[bytes] = []
     topic = full_name(world.namespace, key)
@@ -130,7 +133,32 @@ def test_a_late_viewer_gets_the_last_message_of_a_rare_key(world: World, key: st
     relay.follow({topic}, set())
     assert logged == []
     relay.follow({topic}, {topic})
-    assert logged == [b"the last one"]
+    assert logged == [b"the last one"] * again
+
+
+def test_a_topic_is_shown_until_its_last_viewer_has_gone() -> None:
+    shown, channel = ShownTopics(lambda: None), cast(Any, SimpleNamespace(topic="/odom"))
+    first, second = (cast(Any, SimpleNamespace(id=number)) for number in (1, 2))
+    for client in (first, second):
+        shown.on_subscribe(client, channel)
+        assert shown.take() == ({"/odom"}, {"/odom"})
+    shown.on_unsubscribe(first, channel)
+    assert shown.take() == ({"/odom"}, set())
+    shown.on_unsubscribe(second, channel)
+    assert shown.take() == (set(), set())
+
+
+def test_each_end_of_the_daemon_is_reported_and_its_first_start_is_not(world: World) -> None:
+    world.daemon(zenoh.SampleKind.PUT)
+    world.passes(1.0)
+    assert (world.printed, world.queries) == ([], 0)
+    for _ in range(2):
+        world.daemon(zenoh.SampleKind.DELETE)
+        world.passes(1.0)
+        world.daemon(zenoh.SampleKind.PUT)
+        world.passes(3.0)
+    assert world.printed == [GONE, BACK] * 2
+    assert world.server.shown == [GONE, "without daemon"] * 2
 
 
 def test_an_unreadable_daemon_is_queried_once_a_second_and_reported_once(

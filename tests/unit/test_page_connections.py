@@ -71,8 +71,11 @@ async def test_a_connection_beyond_the_limit_is_closed_and_the_next_has_the_plac
         reader, writer = await asyncio.open_connection(host, port)
         writer.write(b"GET / HTTP/1.1\r\nHost: localhost\r\n\r\n")
         assert (await reader.readline()).split()[1] == b"404"
-        for _, writer in opened:
-            writer.close()
+        late, last = await asyncio.open_connection(host, port)
+        assert not await is_open(late)
+        assert counts.refused() == {"crowded": 2}
+        for _, each in [*opened, (reader, writer), (late, last)]:
+            each.close()
 
 
 NO_BODY = Mock(is_eof=lambda: True)

@@ -15,7 +15,7 @@ import pytest
 
 from acsard.bus import certificate_watch
 from acsard.bus.tls_files import KEY
-from acsard.cli import parser, web
+from acsard.cli import main, parser, web
 from acsard.core.config.settings import LogConfig
 from acsard.host.errors import CertificateError, InUseError, UsageError
 from acsard.host.logs import Log
@@ -140,6 +140,19 @@ def test_an_invitation_is_refused_if_the_server_could_not_start(
     with pytest.raises(CertificateError, match="tls init"):
         web.main_invite(parser(["web"]).parse_args(words))
     assert list(tmp_path.iterdir()) == []
+
+
+def test_an_invitation_ends_with_the_command_that_revokes_it(
+    tls: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("STATE_DIRECTORY", str(tmp_path / "state"))
+    address = ["--address", "https://0.0.0.0:8443"]
+    assert main(["web", "--tls", tls, *address, "invite", "viewer", "--name", "tv"]) == 0
+    *_, command = capsys.readouterr().out.strip().splitlines()
+    words = command.partition("acsard ")[2].split()
+    assert main(words) == 0
+    assert capsys.readouterr().out == "tv is revoked\n"
+    assert Vault(tmp_path / "state", "acsar").all() == []
 
 
 async def test_one_thread_waits_for_a_hanging_disk_and_then_everything_is_read_again(

@@ -17,6 +17,7 @@ from msgspec.structs import replace
 from yarl import URL
 
 from acsard.bus.address import Address
+from acsard.bus.zenoh_sessions import MAX_MESSAGE_BYTES
 from acsard.core.config.settings import WebConfig
 from acsard.web.answers import unsent_bytes
 from acsard.web.app import Page
@@ -240,3 +241,55 @@ async def test_a_path_called_with_another_method_names_the_method_it_accepts(who
             assert (await answer.json())["error"] == "this path accepts only POST"
         async with session.post(url / "api/nothing") as answer:
             assert answer.status == 404
+
+
+async def test_an_ordinary_request_for_the_websocket_is_told_what_the_address_is(
+    whole: Whole,
+) -> None:
+    async with whole.served() as (url, session), session.get(url / "ws") as answer:
+        assert answer.status == 400
+        assert "connect to it with ws://" in (await answer.json())["error"]
+
+
+async def test_a_body_that_never_arrives_is_answered_and_named(
+    whole: Whole, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("acsard.web.app.BODY_TIMEOUT_S", 0.1)
+    async with whole.served() as (url, _):
+        reader, writer = await asyncio.open_connection(url.host, url.port)
+        head = "POST /api/srv/clear HTTP/1.1\r\nHost: localhost\r\nContent-Length: 9\r\n\r\n"
+        writer.write(head.encode())
+        async with asyncio.timeout(PATIENCE_S):
+            assert (await reader.readline()).split()[1] == b"408"
+            assert b'"no body arrived within 0.1 s"' in await reader.readuntil(b"}")
+        writer.close()
+
+
+async def test_a_message_beyond_the_limit_ends_its_websocket_and_is_counted_as_too_big(
+    whole: Whole,
+) -> None:
+    async with whole.hands() as ours:
+        await ours.say(call="x" * MAX_MESSAGE_BYTES)
+        await eventually(whole.counts.refused)
+        assert whole.counts.refused() == {"too_big": 1}
+        async with asyncio.timeout(PATIENCE_S):
+            while not ours.socket.closed:
+                await ours.socket.receive()
+
+
+async def test_a_bug_of_the_server_is_not_counted_against_the_client(whole: Whole) -> None:
+    whole.robot.about = cast(Any, None)
+    async with whole.served() as (url, session), session.get(url / "metrics") as answer:
+        assert answer.status == 500
+        assert whole.counts.refused() == {}
+
+
+async def test_a_token_that_is_not_json_is_refused_with_the_reason(whole: Whole) -> None:
+    async with whole.served() as (url, session):
+        own = {"Origin": str(url.origin())}
+        async with session.post(url / "token", data=b"{", headers=own) as answer:
+            assert (answer.status, (await answer.json())["error"]) == (
+                400,
+                "send the token as JSON",
+            )
+        assert whole.counts.refused() == {"malformed": 1}

@@ -50,6 +50,17 @@ def test_a_missing_group_or_program_of_the_units_is_reported_with_a_remedy() -> 
     assert f"SupplementaryGroups={GROUP}" in unit
 
 
+@pytest.mark.skipif(
+    os.geteuid() != 0 or versions.HOME.exists(), reason="needs root, and no service"
+)
+@each("words", [("rollback",), ("upgrade", "/nowhere")])
+def test_without_a_service_there_is_nothing_to_upgrade(
+    words: tuple[str, ...], capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["service", *words]) == 1
+    assert "`acsard service install` installs this version" in capsys.readouterr().err
+
+
 @pytest.fixture(name="wanted")
 def _wanted(tmp_path: Path) -> list[File]:
     """Return a unit and a first configuration, neither of them written yet."""

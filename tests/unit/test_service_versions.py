@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import os
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -35,6 +36,10 @@ def test_a_new_version_in_use_makes_the_one_before_it_the_previous_one(tmp_path:
         versions.use("0.3.0", tmp_path)
         assert (versions.current(tmp_path), versions.previous(tmp_path)) == ("0.3.0", "0.2.0")
     assert (tmp_path / "current" / "bin").is_dir(), "the link is relative"
+    versions.go_back("0.2.0", "0.1.0", tmp_path)
+    assert (versions.current(tmp_path), versions.previous(tmp_path)) == ("0.2.0", "0.1.0")
+    versions.go_back("0.3.0", "", tmp_path)
+    assert (versions.current(tmp_path), versions.previous(tmp_path)) == ("0.3.0", "")
 
 
 def test_the_link_is_never_missing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -186,6 +191,27 @@ def test_only_a_package_or_an_environment_is_a_new_version(tmp_path: Path) -> No
     (tmp_path / "x.deb").write_text("no package")
     with pytest.raises(MendableError, match="dpkg-deb"):
         prepare(tmp_path / "x.deb")
+
+
+@pytest.mark.skipif(shutil.which("dpkg-deb") is None, reason="needs dpkg-deb")
+def test_the_package_of_another_program_is_refused_before_apt_gets_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    control = tmp_path / "other" / "DEBIAN" / "control"
+    control.parent.mkdir(parents=True)
+    fields = {"Package": "other", "Version": "1", "Architecture": "all", "Description": "x"}
+    fields["Maintainer"] = "x <x@example.org>"
+    control.write_text("".join(f"{name}: {value}\n" for name, value in fields.items()))
+    package = tmp_path / "other.deb"
+    words = ["dpkg-deb", "--root-owner-group", "--build", str(control.parent.parent), str(package)]
+    subprocess.run(words, check=True, stdout=subprocess.DEVNULL)
+    programs = tmp_path / "bin"  # without apt
+    programs.mkdir()
+    for name in ("dpkg-deb", "tar"):
+        (programs / name).symlink_to(shutil.which(name) or "")
+    monkeypatch.setenv("PATH", str(programs))
+    with pytest.raises(MendableError, match=r"other\.deb is the package other; name a package of"):
+        prepare(package)
 
 
 def test_an_environment_whose_program_cannot_copy_itself_is_refused(tmp_path: Path) -> None:
