@@ -43,17 +43,15 @@ SLOW = {
 # processes, or tests of one function below the wrapped ones do. A new code is not for this list.
 ELSEWHERE = {
     "bad_attachment", "bad_echo", "certificates_unreadable", "clock_wrong", "computer_hot",
-    "computer_steal", "configuration_doubtful", "copied", "daemon_absent", "daemon_behind_router",
-    "daemon_elsewhere", "displaced", "emergency_stop_released", "encoder_counts_many",
-    "encoder_counts_misnamed", "encoder_counts_not_turned", "equal", "from_future",
-    "gateway_absent", "gateway_open", "guard_no_checksum", "guard_no_command", "guard_no_link",
-    "guard_too_long", "gyro_in_degrees", "gyro_not_believed", "gyro_reversed", "lines_too_rare",
+    "computer_steal", "copied", "daemon_elsewhere", "displaced", "emergency_stop_released",
+    "encoder_counts_many", "encoder_counts_misnamed", "encoder_counts_not_turned", "equal",
+    "from_future", "guard_no_checksum", "guard_no_command", "guard_no_link", "guard_too_long",
+    "gyro_in_degrees", "gyro_not_believed", "gyro_reversed", "lines_too_rare",
     "link_stops_at_zeros", "no_attachment", "no_echo", "no_emergency_stop", "no_rate", "other_run",
-    "other_version", "out_of_range", "port_denied", "port_held_by_acsard", "port_not_serial",
-    "port_slow", "port_unknown_board", "recording_fails", "reply_period", "reply_rate_none",
-    "reply_rate_rare", "round_trip_none", "router_absent", "runaway_against", "second_sender",
-    "stamps", "stopped_by_others", "too_big", "too_many_clocks", "too_many_senders",
-    "unknown_encoding", "unknown_format", "wildcard", "wrong_wheels",
+    "other_version", "out_of_range", "port_held_by_acsard", "port_slow", "port_unknown_board",
+    "recording_fails", "reply_period", "reply_rate_none", "reply_rate_rare", "round_trip_none",
+    "runaway_against", "second_sender", "stamps", "stopped_by_others", "too_big", "too_many_clocks",
+    "too_many_senders", "unknown_encoding", "unknown_format", "wildcard", "wrong_wheels",
 }  # fmt: skip
 
 LEAST = 2000  # collected tests of a run of all

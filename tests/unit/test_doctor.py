@@ -11,6 +11,7 @@ import socket
 import stat
 import subprocess
 import sys
+from collections.abc import Iterable
 from pathlib import Path
 
 import pytest
@@ -25,7 +26,16 @@ from acsard.host import real_time
 from acsard.host.errors import CertificateError, NoAnswerError
 from acsard.host.kernel_counters import Kernel
 from acsard.machine import examination, versions
-from acsard.machine.examination import Running, clocks, compared, examine, reported, routers
+from acsard.machine.examination import (
+    Running,
+    clocks,
+    compared,
+    examine,
+    gateway,
+    query_or_finding,
+    reported,
+    routers,
+)  # fmt: skip
 from acsard.machine.finding import Finding
 from acsard.machine.local_findings import scheduling, serial_port, slowness, unused_version
 from acsard.machine.serial_ports import BOARDS
@@ -227,6 +237,68 @@ def test_a_program_that_uses_the_port_in_place_of_the_daemon_is_a_failure() -> N
     assert used.mend == "end that program, unless it belongs to your simulator of the board"
 
 
+def codes(findings: Iterable[Finding]) -> list[str]:
+    return [finding.code for finding in findings]
+
+
+def test_the_simulator_needs_no_port_and_a_file_is_none(tmp_path: Path) -> None:
+    file = tmp_path / "port"
+    file.touch()
+    assert codes(serial_port("sim", simulated=True)) == ["port_simulated"]
+    assert codes(serial_port("sim", simulated=False)) == []
+    assert codes(serial_port(str(file), simulated=False)) == ["port_not_serial"]
+    assert codes(serial_port(str(tmp_path / "none"), simulated=False)) == ["port_missing"]
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="root has a port that another user may not open")
+def test_a_port_that_this_user_may_not_open_is_named_with_the_remedy() -> None:
+    board, port = pty.openpty()
+    try:
+        os.setresuid(65534, 65534, 0)
+        try:
+            first = next(serial_port(os.ttyname(port), simulated=False))
+        finally:
+            os.setresuid(0, 0, 0)
+    finally:
+        for end in (board, port):
+            os.close(end)
+    assert (first.code, first.level) == ("port_denied", "failure")
+    assert first.mend
+
+
+def test_a_router_a_gateway_and_a_daemon_are_looked_for_where_they_should_listen() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        here = f"127.0.0.1:{server.getsockname()[1]}"
+        with socket.create_server(("127.0.0.1", 0)) as closed:
+            nowhere = f"127.0.0.1:{closed.getsockname()[1]}"
+        both = [f"tls/{here}", f"tls/{nowhere}"]
+        bus = BusConfig(listen=("tcp/127.0.0.1:1", *both))
+        assert codes(gateway(replace(FILE, bus=bus))) == ["gateway_open", "gateway_absent"]
+        config = replace(FILE, bus=BusConfig(connect=tuple(both)))
+        (absent,) = routers(config, running=False)
+        assert (absent.code, nowhere in absent.text) == ("router_absent", True)
+        assert codes(routers(config, running=True)) == []
+    for bus, code in (
+        (BusConfig(), "daemon_absent"),
+        (BusConfig(connect=(f"tcp/{nowhere}",)), "daemon_absent"),
+        (BusConfig(mode="client", connect=(f"tcp/{nowhere}",)), "daemon_behind_router"),
+    ):
+        at = Address(f"tcp/{nowhere}", "acsar", "")
+        found = query_or_finding(replace(FILE, bus=bus), at)
+        assert isinstance(found, Finding)
+        assert found.code == code
+
+
+def test_a_setting_with_a_surprising_effect_is_a_warning_also_without_a_daemon() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as closed:
+        nowhere = f"tcp/127.0.0.1:{closed.getsockname()[1]}"
+    text = b"commands.sources = []\n"
+    found = list(examine("x", text, {}, lambda _: Address(nowhere, "acsar", "")))
+    (doubtful,) = [one for one in found if one.code == "configuration_doubtful"]
+    assert "no program can drive this robot" in doubtful.text
+    assert doubtful.level == "warning"
+
+
 def test_without_real_time_in_the_configuration_no_warning_is_given() -> None:
     (finding,) = scheduling(False, 77)
     assert finding.level == "ok"
@@ -234,6 +306,7 @@ def test_without_real_time_in_the_configuration_no_warning_is_given() -> None:
 
 def test_each_present_cause_of_lateness_is_a_warning_with_a_remedy(tmp_path: Path) -> None:
     files = {HWMON + "in0_lcrit_alarm": "1\n", POLICY + "scaling_governor": "powersave\n"}
+    assert codes(slowness(Kernel(write(tmp_path, QUIET)))) == ["computer_well"]
     findings = list(slowness(Kernel(write(tmp_path, QUIET | files))))
     assert [finding.level for finding in findings] == ["warning", "warning"]
     assert "supply voltage is too low" in findings[0].text

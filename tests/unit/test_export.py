@@ -70,6 +70,7 @@ def test_the_mcap_library_finds_the_export_finished_indexed_and_compressed(
     count = export(Recording([path]), new, "mcap", config)
     with new.open("rb") as stream:
         reader = make_reader(stream)
+        assert reader.get_header().profile == "ros2"
         summary = reader.get_summary()
         assert summary is not None
         assert summary.statistics is not None

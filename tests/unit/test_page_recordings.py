@@ -58,3 +58,21 @@ async def test_a_fresh_robot_has_an_empty_list_of_recordings(
     assert await box.rows() == []
     with pytest.raises(RequestRefusedError, match="does not exist"):
         await box.find("000001-20261121T070027Z.rec.zst")
+
+
+async def test_recordings_that_cannot_be_read_are_explained(tmp_path: Path) -> None:
+    file = tmp_path / "record"
+    file.touch()
+    away = robot_with(str(tmp_path))
+    away.endpoint = "tcp/192.168.1.7:7447"
+    for robot, why in ((away, "on another machine"), (robot_with(str(file)), "Not a directory")):
+        for look in (BlackBox(robot).rows(), BlackBox(robot).find("x")):
+            with pytest.raises(TroubleError, match=why):
+                await look
+
+
+def test_a_recording_whose_name_has_no_time_is_listed_without_one(tmp_path: Path) -> None:
+    path = tmp_path / "000001-later.rec.zst"
+    path.touch()
+    (row,) = rows([path, tmp_path / "deleted"])
+    assert (row.begin, row.seconds) == (None, None)

@@ -191,6 +191,27 @@ async def test_one_thread_waits_for_a_hanging_disk_and_then_everything_is_read_a
         log.close()
 
 
+def test_the_page_keeps_its_certificate_until_the_new_one_is_whole_and_then_reports_it_once(
+    tls: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(certificate_watch, "FILES_CHECK_PERIOD_NS", 0)
+    out = io.StringIO()
+    log = Log(LogConfig(), out)
+    certificate, key = Certificate(tls, log), Path(tls) / KEY
+    before, good = certificate.context, key.read_bytes()
+    key.write_bytes(b"damaged")
+    for _ in range(3):
+        certificate.read()
+    assert certificate.context is before
+    key.write_bytes(good)
+    for _ in range(3):
+        certificate.read()
+    assert certificate.context is not before
+    log.close()
+    assert out.getvalue().count("TLS certificate") == 1
+    assert "uses its new TLS certificate and keeps" in out.getvalue()
+
+
 async def test_the_connections_of_a_revoked_token_end_with_the_reading_that_misses_it(
     tmp_path: Path,
 ) -> None:

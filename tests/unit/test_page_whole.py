@@ -6,6 +6,7 @@ import asyncio
 import socket
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager, closing
+from functools import partial
 from pathlib import Path
 from typing import Any, cast
 from unittest.mock import Mock
@@ -224,6 +225,15 @@ async def test_a_camera_that_cannot_be_shown_is_explained(
     whole.page.end_all("")
 
 
+async def test_a_camera_at_another_address_is_explained(tmp_path: Path) -> None:
+    with closing(Stream()) as stream:
+        whole = Whole(tmp_path, WebConfig(camera=f"http://127.0.0.1:{stream.port}/other"))
+        async with whole.served() as (url, session), session.get(url / "api/camera") as answer:
+            problem = await answer.json()
+        assert problem["detail"] == "the camera answered 404: correct web.camera"
+        whole.page.end_all("")
+
+
 async def test_no_other_page_can_frame_the_page_or_add_scripts_to_it(whole: Whole) -> None:
     async with whole.served() as (url, session):
         for path in ("", "page/main.js", "api/whoami", "nothing"):
@@ -293,3 +303,69 @@ async def test_a_token_that_is_not_json_is_refused_with_the_reason(whole: Whole)
                 "send the token as JSON",
             )
         assert whole.counts.refused() == {"malformed": 1}
+
+
+async def test_a_message_that_is_not_obeyed_is_answered_with_the_reason(tmp_path: Path) -> None:
+    whole = Whole(tmp_path, WebConfig(local="operator"))
+    wish = {"linear_x": 0.1, "angular_z": 0.0}
+    async with whole.hands() as ours:
+
+        async def answer(key: str) -> Any:
+            return await ours.find(lambda frame: key in frame)
+
+        messages: list[tuple[dict[str, Any], str, str]] = [
+            ({"subscribe": "odometry"}, "subscribe", "is not a key to follow; choose one of"),
+            ({"cmd": wish, "source": "nav"}, "cmd", "is not one of the robot's sources: teleop, "),
+            ({"ping": 1, "call": "stop"}, "message", "exactly one of the fields"),
+        ]
+        for message, kind, words in messages:
+            await ours.say(**message)
+            refused = await answer("refused")
+            assert refused["refused"] == kind
+            assert words in refused["reason"]
+        await ours.find(lambda frame: "answer" in frame)  # the stop
+        await ours.socket.send_bytes(b"{}")
+        await eventually(lambda: whole.counts.refused() == {"malformed": 4})
+        for key in ("odom", "state", "tf", "wheel_states", "battery", "cmd_vel_out"):
+            await ours.say(subscribe=key, rate=50.0)
+        await ours.say(subscribe="events", rate=1.0)
+        assert "300 messages a second: lower some" in (await answer("refused"))["reason"]
+        await ours.say(subscribe="state", rate=10.0)  # another rate of a known key
+        await ours.say(unsubscribe="odom")
+        await ours.say(subscribe="events", rate=1.0)
+        await ours.say(ping=7)
+        assert (await answer("pong"))["pong"] == 7
+        (viewer,) = whole.page._viewers
+        rates = {key: 1.0 / one.period for key, one in viewer._out.following.items()}
+        assert (rates["state"], rates["events"], "odom" in rates) == (10.0, 1.0, False)
+        assert not (await ours.call("set"))["ok"]
+        assert "is not the name of a service" in (await ours.call("no such"))["text"]
+    assert whole.counts.refused() == {"malformed": 5, "role": 1, "too_many": 1}
+
+
+class Driven:
+    """The connection to a daemon, which takes commands."""
+
+    session: Any = None
+
+    def __init__(self) -> None:
+        self.speeds: list[float] = []
+
+    def put(self, twist: Any, *_: object) -> None:
+        self.speeds.append(twist.linear.x)
+
+
+@pytest.mark.parametrize("abrupt", [True, False])
+async def test_a_viewer_that_drives_and_goes_away_leaves_a_zero(whole: Whole, abrupt: bool) -> None:
+    driven = whole.robot.client = cast(Any, Driven())
+    async with whole.hands() as ours:
+        await ours.find(lambda frame: "hello" in frame)
+        for speed in (0.0, 0.5):
+            await ours.drive(speed)
+            await eventually(partial(driven.speeds.__contains__, speed))
+        if abrupt:
+            cast(Any, ours.socket)._response.connection.transport.abort()
+        else:
+            await ours.socket.close()
+        await eventually(lambda: driven.speeds[-1] == 0.0)
+    assert driven.speeds == [0.0, 0.5, 0.0]

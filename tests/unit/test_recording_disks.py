@@ -12,6 +12,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from itertools import pairwise
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -135,6 +136,25 @@ def test_a_call_that_fails_is_reported_once_and_costs_steps_that_are_counted(
         )
         assert [event.level for event in box.said].count("warning") == 1
     box.end()
+
+
+def test_recordings_that_other_programs_pushed_off_the_disk_are_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for number in range(1, 31):
+        path = tmp_path / f"{number:06}-20261121T070027Z{SUFFIX}"
+        path.touch()
+        os.truncate(path, 1_000_000)
+    full = SimpleNamespace(f_blocks=1 << 20, f_bavail=0, f_frsize=4096)
+    monkeypatch.setattr(os, "statvfs", lambda _: full)
+    box = Box(tmp_path, monkeypatch)
+    box.record(2)
+    warning, begun = box.said
+    assert (warning.name, warning.level) == ("recording", "warning")
+    assert "recordings deleted (000001-" in warning.text
+    assert begun.text == f"the daemon records to {tmp_path}"
+    assert 0 < len(listed(tmp_path)) < 12
+    box.recorder.close()
 
 
 def test_a_directory_that_was_removed_is_reported_and_made_again(box: Box) -> None:

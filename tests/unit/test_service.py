@@ -61,6 +61,19 @@ def test_without_a_service_there_is_nothing_to_upgrade(
     assert "`acsard service install` installs this version" in capsys.readouterr().err
 
 
+@pytest.mark.skipif(os.geteuid() != 0, reason="needs root, to become another user")
+@each("words", [("install",), ("uninstall",), ("upgrade", "/x"), ("rollback",)])
+def test_only_root_may_change_the_service(
+    words: tuple[str, ...], capsys: pytest.CaptureFixture[str]
+) -> None:
+    os.seteuid(65534)
+    try:
+        assert main(["service", *words]) == 77
+    finally:
+        os.seteuid(0)
+    assert "run this command with sudo" in capsys.readouterr().err
+
+
 @pytest.fixture(name="wanted")
 def _wanted(tmp_path: Path) -> list[File]:
     """Return a unit and a first configuration, neither of them written yet."""
@@ -97,6 +110,20 @@ def test_a_unit_that_was_edited_is_overwritten_only_by_force(wanted: list[File])
     with pytest.raises(MendableError, match=f"this version of acsard installs: {unit.path};"):
         installing(wanted, force=False)
     assert installing(wanted, force=True)[1:3] == [Write(unit), Write(own)]
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="needs root, to become a user without permission")
+def test_a_file_that_cannot_be_read_is_named_with_the_remedy(tmp_path: Path) -> None:
+    (tmp_path / "unit").touch(0o600)
+    for path, remedy in ((tmp_path / "unit", "with sudo"), (tmp_path, "Is a directory; check")):
+        file = File(path, b"unit")
+        os.seteuid(65534 if path.is_file() else 0)
+        try:
+            assert file.condition() == "unreadable"
+            with pytest.raises(MendableError, match=remedy):
+                installing([file], force=True)
+        finally:
+            os.seteuid(0)
 
 
 @pytest.fixture(name="machine")
@@ -155,7 +182,9 @@ def test_a_removal_says_what_it_leaves_and_a_purge_leaves_nothing(
 
 
 def test_the_files_are_those_of_deploy_with_the_port_of_a_real_robot() -> None:
-    unit, gateway, page, _, configuration = files()
+    unit, gateway, page, rules, configuration = files()
+    assert rules.path == RULES
+    assert rules.content == (source() / "udev" / RULES.name).read_bytes()
     assert (unit.path.name, gateway.path.name, page.path.name) == (UNIT, GATEWAY, PAGE)
     assert b'port = "/dev/acsar"' in configuration.content
 

@@ -126,7 +126,14 @@ def test_a_copy_with_other_content_gets_a_name_of_its_own(
 
     monkeypatch.setattr(versions, "_fill", fill)
     monkeypatch.setattr(versions, "_require_start", lambda place: None)
-    first = versions.copy(tmp_path)
+    before = os.umask(0o077)
+    try:
+        first = versions.copy(tmp_path)
+    finally:
+        os.umask(before)
+    # The service's user must be able to read what root has copied.
+    paths = [tmp_path / first, *(tmp_path / first).rglob("*")]
+    assert {path.stat().st_mode & 0o777 for path in paths} == {0o755, 0o644}
     assert versions.copy(tmp_path) == first
     content = "two"
     second = versions.copy(tmp_path)
@@ -136,6 +143,49 @@ def test_a_copy_with_other_content_gets_a_name_of_its_own(
     assert versions.is_own(first)
     assert versions.is_own(second)
     assert sorted(os.listdir(tmp_path)) == sorted((first, second))
+
+
+def test_a_copy_that_does_not_start_is_refused_and_leaves_no_part(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fill(place: Path, python: str) -> None:
+        (place / "bin").mkdir()
+        (place / "bin" / "acsard").write_text("#!/bin/sh\necho no numpy >&2\nexit 3\n")
+        (place / "bin" / "acsard").chmod(0o755)
+
+    monkeypatch.setattr(versions, "_fill", fill)
+    with pytest.raises(MendableError, match="the copy of acsard does not start: no numpy; correct"):
+        versions.copy(tmp_path)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_one_program_changes_versions_at_a_time_and_clears_what_a_killed_one_left(
+    tmp_path: Path,
+) -> None:
+    home = tmp_path / "opt" / "acsard"
+    for _ in range(2):
+        versions.make_home(home)
+    assert home.stat().st_mode & 0o777 == 0o755
+    (home / ".unfinished-x" / "lib").mkdir(parents=True)
+    with versions.changing(home):
+        assert list(home.iterdir()) == []
+        with (
+            pytest.raises(MendableError, match="another program changes the version in"),
+            versions.changing(home),
+        ):
+            raise AssertionError
+    with versions.changing(home):
+        pass
+
+
+def test_only_versions_that_nothing_needs_are_removed(tmp_path: Path) -> None:
+    versions_in(tmp_path, "0.1.0", "0.2.0", "0.3.0", "0.4.0")
+    for name in ("0.2.0", "0.3.0"):
+        versions.use(name, tmp_path)
+    (tmp_path / versions.PACKAGE / "0.4.0").mkdir(parents=True)
+    versions.remove_others(tmp_path)
+    assert versions.installed(tmp_path) == ["0.2.0", "0.3.0", "0.4.0"]
+    assert not list(tmp_path.glob(".*"))
 
 
 def seen(
