@@ -19,6 +19,7 @@ from acsard.cli.command_line import VERBS
 from acsard.cli.move import _parsed
 from acsard.cli.robot_options import Silence
 from acsard.client.follower import FIRST_STATE_TIMEOUT_S
+from acsard.client.identity import ClientIdentity
 from acsard.core.messages.schema import ServiceReply
 from acsard.core.values import Pose
 from acsard.host import errors
@@ -26,6 +27,7 @@ from acsard.host.errors import (
     MendableError,
     UsageError,
 )
+from acsard.top import terminal
 from tests.each import each
 from tests.unit.screens import STATE
 
@@ -197,6 +199,21 @@ def test_a_call_with_other_numbers_is_refused_before_it_is_sent(
     monkeypatch.setattr(robot_options, "open_connection", lambda *_, **__: pytest.fail("sent"))
     assert main(["call", *words.split()]) == 2
     assert why in capsys.readouterr().err
+
+
+@each(("role", "code"), [("viewer", 77), ("", 69)])
+def test_a_keyboard_whose_certificate_may_not_drive_is_refused_before_the_screen_opens(
+    role: Any, code: int, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    us = ClientIdentity(role, "ann", "0123")
+    robot = SimpleNamespace(where=SimpleNamespace(tls="tls"), whoami=lambda: us)
+    monkeypatch.setattr(robot_options, "open_connection", lambda *_, **__: nullcontext(robot))
+    monkeypatch.setenv("TERM", "xterm")
+    for stream in (sys.stdin, sys.stdout):
+        monkeypatch.setattr(stream, "isatty", lambda: True)
+    monkeypatch.setattr(terminal, "drive", lambda _: pytest.fail("the screen opened"))
+    assert main(["drive"]) == code
+    assert us.describe() in capsys.readouterr().err
 
 
 def test_an_interrupted_drive_prints_how_far_it_came_and_what_is_wrong(

@@ -16,7 +16,7 @@ from acsard.cli.check import main
 from acsard.cli.common import load, overrides, with_record_directory
 from acsard.cli.robot_options import require_readable, robot_address
 from acsard.core.config.parsing import parse
-from acsard.core.config.settings import Config, McuConfig, WebConfig
+from acsard.core.config.settings import BusConfig, Config, McuConfig, WebConfig
 from acsard.host import config_file
 from acsard.host.config_file import SEARCH_PATHS, find
 from acsard.host.errors import CertificateError, Exit, MendableError, UsageError
@@ -255,6 +255,12 @@ def test_the_banner_has_the_approved_words(approved: Callable[[Path, str], None]
     }
     text = "".join(f"--- {what}\n{banner}" for what, banner in banners.items())
     approved(Path(__file__).with_name("words") / "banner.txt", text.replace(version(), "VERSION"))
+
+
+def test_the_banner_names_the_router_of_a_robot_that_listens_nowhere() -> None:
+    bus = BusConfig(mode="client", connect=("tcp/r:7447",))
+    text = run.banner(Config(bus=bus), "x.toml", "/dev/x")
+    assert "bus     client of the Zenoh router at tcp/r:7447, keys " in text
 
 
 def test_on_a_terminal_the_page_is_served_unless_it_is_disabled_or_missing(

@@ -292,11 +292,13 @@ def test_a_router_a_gateway_and_a_daemon_are_looked_for_where_they_should_listen
 def test_a_setting_with_a_surprising_effect_is_a_warning_also_without_a_daemon() -> None:
     with socket.create_server(("127.0.0.1", 0)) as closed:
         nowhere = f"tcp/127.0.0.1:{closed.getsockname()[1]}"
-    text = b"commands.sources = []\n"
+    text = b"commands.sources = []\n[mcu]\nport = '/dev/none'\n"
     found = list(examine("x", text, {}, lambda _: Address(nowhere, "acsar", "")))
     (doubtful,) = [one for one in found if one.code == "configuration_doubtful"]
     assert "no program can drive this robot" in doubtful.text
     assert doubtful.level == "warning"
+    assert "port_missing" in codes(found)
+    assert "port_simulated" not in codes(found)
 
 
 def test_without_real_time_in_the_configuration_no_warning_is_given() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import socket
 import sys
 from collections import deque
 from collections.abc import Callable
@@ -34,7 +35,7 @@ from acsard.foxglove.bridge import configuration as module_configuration
 from acsard.foxglove.relay import EventDeduplicator
 from acsard.foxglove.server import ShownTopics, start
 from acsard.host import clock
-from acsard.host.errors import NotPermittedError, ReplyError
+from acsard.host.errors import InUseError, NotPermittedError, ReplyError
 from tests.each import each
 from tests.unit.screens import raw_sample, sample_of
 
@@ -231,6 +232,14 @@ def test_a_port_that_needs_root_is_refused_with_another_one() -> None:
         os.seteuid(user)
 
 
+def test_a_port_of_another_viewer_is_refused_with_another_one() -> None:
+    robot: Any = SimpleNamespace(where=Address("tcp/127.0.0.1:1", "acsar", ""))
+    with socket.create_server(("127.0.0.1", 0)) as other:
+        at = ("127.0.0.1", other.getsockname()[1])
+        with pytest.raises(InUseError, match=rf"cannot listen on .*:{at[1]}: .* --address "):
+            start(robot, RosConfig(), at, ShownTopics(lambda: None), Context())
+
+
 def test_each_end_of_the_daemon_is_reported_and_its_first_start_is_not(world: World) -> None:
     world.daemon(zenoh.SampleKind.PUT)
     world.passes(1.0)
@@ -275,13 +284,17 @@ def test_the_configuration_is_read_again_if_the_daemon_restarts_meanwhile(
 
 
 def test_a_viewer_that_comes_while_the_daemon_is_gone_is_told(world: World) -> None:
-    world.daemon(zenoh.SampleKind.DELETE)
-    world.passes(1.0)
-    client, channel = SimpleNamespace(id=1), SimpleNamespace(topic="/odom")
-    world.bridge._shown_topics.on_subscribe(cast(Any, client), cast(Any, channel))
-    world.bridge._relay.follow = lambda *_: None  # type: ignore[method-assign]
-    world.passes(1.0)
-    assert world.server.shown == [GONE, GONE]
+    rounds: list[Any] = []
+    channel = cast(Any, SimpleNamespace(topic="/odom"))
+    world.bridge._relay.follow = lambda *topics: rounds.append(topics)  # type: ignore[method-assign]
+    for number, shown in ((1, []), (2, [GONE, GONE])):
+        world.bridge._shown_topics.on_subscribe(cast(Any, SimpleNamespace(id=number)), channel)
+        world.passes(1.0)
+        assert world.server.shown == shown
+        world.daemon(zenoh.SampleKind.DELETE)
+        world.passes(1.0)
+    assert [fresh for _, fresh in rounds if fresh] == [{"/odom"}] * 2
+    assert all(topics == {"/odom"} for topics, _ in rounds)
 
 
 @pytest.mark.timeout(20)

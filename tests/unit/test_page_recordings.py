@@ -45,6 +45,14 @@ async def test_the_recordings_of_another_robot_are_not_shown_as_those_of_this_on
         await box.find(path.name)
 
 
+async def test_a_recording_that_has_just_begun_is_listed(tmp_path: Path) -> None:
+    path = tmp_path / "000001-20261121T070027Z.rec.zst"
+    path.touch()
+    box = BlackBox(robot_with(str(tmp_path)))
+    assert [(row.name, row.bytes) for row in await box.rows()] == [(path.name, 0)]
+    assert await box.find(path.name) == path
+
+
 def robot_with(directory: str) -> Any:
     about = SimpleNamespace(recordings=directory)
     return SimpleNamespace(id="acsar", endpoint="tcp/127.0.0.1:7447", about=about)

@@ -22,7 +22,7 @@ from acsard.bus.zenoh_sessions import MAX_MESSAGE_BYTES
 from acsard.core.config.settings import WebConfig
 from acsard.web.answers import unsent_bytes
 from acsard.web.app import Page
-from acsard.web.connections import Connections
+from acsard.web.connections import MAX_WAITING_BYTES, Connections
 from acsard.web.followed_robot import About, FollowedRobot
 from acsard.web.metrics import Counts
 from acsard.web.socket_sender import MAX_UNREAD_BYTES
@@ -285,6 +285,14 @@ async def test_a_message_beyond_the_limit_ends_its_websocket_and_is_counted_as_t
         async with asyncio.timeout(PATIENCE_S):
             while not ours.socket.closed:
                 await ours.socket.receive()
+
+
+async def test_a_websocket_may_send_more_than_waits_behind_a_request(whole: Whole) -> None:
+    async with whole.hands() as ours:
+        for _ in range(1 + 2 * MAX_WAITING_BYTES // 50_000):
+            await ours.say(subscribe="x" * 50_000)
+        await ours.say(ping=7)
+        await ours.find(lambda frame: frame.get("pong") == 7)
 
 
 async def test_a_bug_of_the_server_is_not_counted_against_the_client(whole: Whole) -> None:

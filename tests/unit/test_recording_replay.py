@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 
 import pytest
@@ -76,3 +77,16 @@ def test_a_failure_that_cannot_be_tried_again_is_reported_with_the_reason(tmp_pa
             frames.end()
         _, playback, _ = played(path)
         assert words in playback.failed_step()
+
+
+def test_two_paths_are_as_far_apart_as_at_their_farthest(tmp_path: Path) -> None:
+    drive = replace(CONFIG.drive, wheel_radius=2 * CONFIG.drive.wheel_radius)
+    recording = Recording([TAPE.save(tmp_path / "a")])
+    playback, farthest = Playback(recording, replace(CONFIG, drive=drive)), 0.0
+    for step, news in playback.steps():
+        if news.estimates:
+            x, y, _ = (part / 1e6 for part in step.recorded.poses[-1])
+            pose = news.estimates[-1].pose
+            farthest = max(farthest, math.hypot(x - pose.x, y - pose.y))
+    assert playback.comparison.max_distance_m == pytest.approx(farthest, abs=1e-5)
+    assert farthest > 0.5

@@ -135,6 +135,19 @@ def test_recorded_texts_cannot_send_control_characters_to_the_terminal(tmp_path:
         assert all(line.isprintable() for line in out.splitlines())
 
 
+@pytest.mark.skipif(os.geteuid() != 0, reason="needs root, to become a user without permission")
+def test_a_directory_that_this_user_may_not_read_ends_with_77(tmp_path: Path) -> None:
+    os.seteuid(65534)
+    try:
+        code, _, err = log(tmp_path)
+    finally:
+        os.seteuid(0)
+    assert (code, "Permission denied" in err) == (Exit.NO_PERMISSION, True)
+    (tmp_path / "file").touch()
+    code, _, err = log(tmp_path / "file")
+    assert (code, "Not a directory" in err) == (Exit.FAILURE, True)
+
+
 def test_the_file_of_another_program_is_refused_as_what_it_is(where: Path, tmp_path: Path) -> None:
     other = tmp_path / "drive.csv"
     code, _, err = log(where, "show", str(other))

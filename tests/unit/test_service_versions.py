@@ -235,6 +235,18 @@ def test_a_version_is_worse_without_the_link_or_with_more_missed_periods(
     assert bool(found) is bool(why)
 
 
+def test_a_version_that_is_installed_is_named_by_its_directory(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    versions_in(tmp_path, "0.3.0")
+    (tmp_path / "0.4.0").mkdir()  # its copy was not finished
+    monkeypatch.setattr(versions, "HOME", tmp_path)
+    monkeypatch.setattr(versions.installed, "__defaults__", (tmp_path,))
+    assert prepare(tmp_path / "0.3.0") == "0.3.0"
+    with pytest.raises(MendableError, match="neither a"):
+        prepare(tmp_path / "0.4.0")
+
+
 def test_only_a_package_or_an_environment_is_a_new_version(tmp_path: Path) -> None:
     with pytest.raises(MendableError, match=r"neither a \.deb nor an environment"):
         prepare(tmp_path)
