@@ -12,17 +12,22 @@ import stat
 import subprocess
 import sys
 from collections.abc import Iterable
+from contextlib import nullcontext
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 from msgspec.structs import replace
 
 from acsard.bus.address import Address
+from acsard.client.identity import ClientIdentity
+from acsard.core.config.parsing import effective
 from acsard.core.config.settings import BusConfig, Config, McuConfig
 from acsard.core.messages.encodings import DecodeError
-from acsard.core.messages.schema import DiagnosticStatus, Info, KeyValue
+from acsard.core.messages.schema import DiagnosticStatus, Info, KeyValue, Time
 from acsard.daemon.serial.device import refusal
-from acsard.host import real_time
+from acsard.host import clock, real_time
 from acsard.host.errors import CertificateError, NoAnswerError
 from acsard.host.kernel_counters import Kernel
 from acsard.machine import examination, versions
@@ -35,7 +40,7 @@ from acsard.machine.examination import (
     query_or_finding,
     reported,
     routers,
-)  # fmt: skip
+)
 from acsard.machine.finding import Finding
 from acsard.machine.local_findings import scheduling, serial_port, slowness, unused_version
 from acsard.machine.serial_ports import BOARDS
@@ -66,6 +71,37 @@ def test_a_reason_of_two_reports_is_printed_once_where_it_is_not_ok() -> None:
         Finding("serial link", "received_nothing", "failure", "down: nothing came", "check"),
         Finding("recording", "", "ok", "on"),
     ]
+
+
+class Answering:
+    """A daemon whose clock is ahead of this computer's by this time, s."""
+
+    def __init__(self, ahead_s: float) -> None:
+        self._ahead_s = ahead_s
+
+    def get(self, key: str) -> Any:
+        now_ns = clock.now().wall_ns + round(self._ahead_s * 1e9)
+        answers = {
+            "info": INFO, "config": effective(FILE), "diagnostics": SimpleNamespace(status=[]),
+            "state": SimpleNamespace(stamp=Time.from_ns(now_ns)),
+        }  # fmt: skip
+        return answers[key]
+
+    def whoami(self) -> ClientIdentity:
+        return ClientIdentity("maintainer", "", "0123")
+
+
+@pytest.mark.parametrize("ahead_s", [0.0, 5.0, -3600.0])
+def test_the_clock_of_a_daemon_is_compared_by_the_time_of_its_answer(
+    ahead_s: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    robot = nullcontext(Answering(ahead_s))
+    monkeypatch.setattr(examination, "open_connection", lambda _: robot)
+    found = examination.query(FILE, Address("tcp/127.0.0.1:1", "acsar", ""))
+    assert 0.0 <= found.round_trip_s < 1.0
+    assert abs(found.ahead_s - ahead_s) <= found.round_trip_s
+    assert (found.config, found.info) == (FILE, INFO)
+    assert codes(clocks(found)) == ["clock_apart"] * bool(ahead_s)
 
 
 def test_each_remedy_is_said_once() -> None:

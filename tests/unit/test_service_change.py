@@ -5,17 +5,20 @@
 
 from __future__ import annotations
 
+import inspect
 import os
 import shutil
+import signal
 from pathlib import Path
 
 import pytest
 
+from acsard.cli import main
 from acsard.host.errors import MendableError
 from acsard.machine import service_installation, upgrade, versions
 from acsard.machine.deploy_files import source
 from acsard.machine.service_installation import GATEWAY, PAGE, RULES, UNIT
-from acsard.machine.upgrade import change, unit_state, watch
+from acsard.machine.upgrade import change, prepare, unit_state, watch
 from tests.system.harness import free_endpoint
 
 OLD, NEW = "0.2.0", "0.3.0"
@@ -42,19 +45,21 @@ class Machine:
             versions.go_back, versions.deploy_of, versions.remove_others,
         ):  # fmt: skip
             monkeypatch.setattr(function, "__defaults__", (self.home,))
+        changing = inspect.unwrap(versions.changing)
+        monkeypatch.setattr(changing, "__defaults__", (self.home,))
         monkeypatch.setattr(versions, "HOME", self.home)
         for name, place in (("UNIT_DIRECTORY", self.units), ("RULES", self.rules)):
             monkeypatch.setattr(service_installation, name, place)
         monkeypatch.setattr(service_installation, "CONFIG_DIRECTORY", root / "etc")
         monkeypatch.setenv("PATH", str(root / "bin"), prepend=os.pathsep)
         for program, text in (("systemctl", SYSTEMCTL), ("udevadm", "#!/bin/sh\nexit 1\n")):
-            self._program(root / "bin" / program, text.format(root=root, home=self.home))
+            self.program(root / "bin" / program, text.format(root=root, home=self.home))
         for version in (OLD, NEW):
             deploy = versions.deploy_of(version)
             for part in ("systemd", "udev"):
                 shutil.copytree(source() / part, deploy / part)
             (deploy / "systemd" / UNIT).write_text(f"# {version}\n")
-            self._program(self.home / version / "bin" / versions.STOP_PROGRAM, "")
+            self.program(self.home / version / "bin" / versions.STOP_PROGRAM, "")
             self.accepts(version, True)
         versions.use(OLD)
         for file in service_installation.system_files(versions.deploy_of(OLD)):
@@ -63,7 +68,7 @@ class Machine:
         self.config.parent.mkdir()
         self.config.write_text(f'[bus]\nlisten = ["{free_endpoint()}"]\n')
 
-    def _program(self, path: Path, text: str) -> None:
+    def program(self, path: Path, text: str) -> None:
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(text)
         path.chmod(0o755)
@@ -71,7 +76,7 @@ class Machine:
     def accepts(self, version: str, accepts: bool) -> None:
         """Let `acsard check` of a version accept or refuse each configuration."""
         does = "exit 0" if accepts else "echo no key is right >&2; exit 78"
-        self._program(self.home / version / "bin" / "acsard", f"#!/bin/sh\n{does}\n")
+        self.program(self.home / version / "bin" / "acsard", f"#!/bin/sh\n{does}\n")
 
     def state(self, unit: str, active: str, restarts: int = 0, version: str = "") -> None:
         text = f"ActiveState={active}\nNRestarts={restarts}\nMainPID=0\nJob=\n"
@@ -187,3 +192,52 @@ def test_a_version_that_another_program_stops_stays_in_use(machine: Machine) -> 
     machine.state(UNIT, "inactive")
     with pytest.raises(MendableError, match=f"another program stopped {UNIT}"):
         watch(upgrade._address(machine.config), None, [UNIT], 5.0)
+
+
+@pytest.mark.parametrize(
+    ("packaged", "change_it", "trouble"),
+    [
+        (NEW, False, ""),
+        (NEW, True, f"version {NEW} of another build is in use already"),
+        ("0.4.0", False, "has no version of acsard"),
+    ],
+)
+def test_a_package_must_bring_the_version_that_it_installs(
+    packaged: str, change_it: bool, trouble: str, machine: Machine
+) -> None:
+    package, listed = machine.root / "new.deb", machine.home / versions.PACKAGE / packaged
+    package.touch()
+    shutil.copytree(machine.home / NEW, listed)
+    if change_it:
+        (listed / "lib" / "module.py").touch()
+    for program, text in (
+        ("dpkg-deb", "echo acsard"),
+        ("apt-get", f'echo "$DEBIAN_FRONTEND $@" >{machine.root}/apt'),
+        ("dpkg-query", f"printf '/.\\n{listed}\\n{listed}/bin\\n'"),
+    ):
+        machine.program(machine.root / "bin" / program, f"#!/bin/sh\n{text}\n")
+    if trouble:
+        with pytest.raises(MendableError, match=trouble):
+            prepare(package)
+    else:
+        assert prepare(package) == NEW
+    asked = (machine.root / "apt").read_text()
+    assert asked.startswith("noninteractive install --yes ")
+    assert asked.endswith(f" {package}\n")
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="only root may change the version")
+def test_a_rollback_goes_to_the_version_before_and_says_if_there_is_none(
+    machine: Machine, capsys: pytest.CaptureFixture[str]
+) -> None:
+    before = signal.getsignal(signal.SIGHUP)
+    try:
+        assert main(["service", "rollback"]) == 1
+        assert "there is no version before the one in use" in capsys.readouterr().err
+        change(NEW, machine.said.append)
+        assert main(["service", "rollback"]) == 0
+        assert (machine.links, machine.unit) == ((OLD, NEW), f"# {OLD}\n")
+        assert main(["service", "upgrade", str(machine.home / NEW)]) == 0
+        assert machine.links == (NEW, OLD)
+    finally:
+        signal.signal(signal.SIGHUP, before)
