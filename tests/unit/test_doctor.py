@@ -71,6 +71,8 @@ def test_a_reason_of_two_reports_is_printed_once_where_it_is_not_ok() -> None:
         Finding("serial link", "received_nothing", "failure", "down: nothing came", "check"),
         Finding("recording", "", "ok", "on"),
     ]
+    (alone,) = reported((waits,))
+    assert (alone.subject, alone.code) == ("mode", "received_nothing")
 
 
 class Answering:

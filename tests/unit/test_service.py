@@ -215,10 +215,17 @@ def test_the_gateway_of_the_service_is_opened_once_and_for_its_own_certificates(
     assert admitting(own) is None, "the user may have changed it"
 
 
+def test_a_step_that_removes_a_directory_says_that_all_in_it_goes(machine: Path) -> None:
+    (machine / "link").symlink_to(machine)
+    assert str(Remove(machine)) == f"remove  {machine}/ and everything in it"
+    assert str(Remove(machine / "link")) == f"remove  {machine / 'link'}"
+
+
 def test_acsard_gets_into_the_path_unless_there_is_one(machine: Path) -> None:
     assert linking() == []
     command = machine / COMMAND.relative_to("/")
     command.unlink()
+    command.parent.rmdir()
     (step,) = linking()
     step.do()
     assert command.readlink() == PROGRAM

@@ -276,6 +276,14 @@ def test_the_package_of_another_program_is_refused_before_apt_gets_it(
         prepare(package)
 
 
+def test_the_last_word_of_an_environment_is_the_version_that_it_copied(tmp_path: Path) -> None:
+    python = tmp_path / "bin" / "python"
+    python.parent.mkdir()
+    python.write_text("#!/bin/sh\necho 1 warning of a library\necho 0.3.0\n")
+    python.chmod(0o755)
+    assert prepare(tmp_path) == "0.3.0"
+
+
 def test_an_environment_whose_program_cannot_copy_itself_is_refused(tmp_path: Path) -> None:
     python = tmp_path / "bin" / "python"
     python.parent.mkdir()
