@@ -43,7 +43,7 @@ class Bridge:
         self._robot, self._id, self._tell = robot, robot.where.robot_id, tell
         robot.name += " foxglove"
         self._wake, self._ended = Event(), False
-        self._here = self._was_here = True
+        self._here = True
         # Whether the daemon has ended since the last query of its configuration. `_here` does not
         # show this if the daemon ends and starts again within one round.
         self._outdated = False
@@ -85,12 +85,10 @@ class Bridge:
         self._wake.set()
 
     def _round(self) -> None:
-        here = self._here
-        if here and self._outdated and clock.steady_s() >= self._retry_s:
-            self._came_back()
-        elif self._was_here and not here:
+        if not self._here:
             self._show(f"the daemon of robot {self._id} is gone; `acsard foxglove` waits for it")
-        self._was_here = here
+        elif self._outdated and clock.steady_s() >= self._retry_s:
+            self._came_back()
         topics, fresh = self._shown_topics.take()
         if fresh and self._problem:
             self._publish_problem()  # for the new viewers

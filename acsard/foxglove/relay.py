@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Collection
+from contextlib import suppress
 
 import foxglove
 import msgspec
@@ -85,7 +86,6 @@ class Relay:
         self._followed: dict[str, Subscription] = {}
         self._deduplicator = EventDeduplicator()
         self._log_topic = ""
-        self.unreadable = 0  # samples that could not be decoded
 
     def offer(self, config: Config) -> None:
         """Offer the robot's topics to the viewers. Topics that were offered before remain."""
@@ -164,8 +164,6 @@ class Relay:
         messages: list[msgspec.Struct] = []
         reader = decoder(key)
         for sample in backlog:
-            try:
+            with suppress(DecodeError):  # of a daemon of another version
                 messages.append(reader.decode(*encoded(sample)))
-            except DecodeError:
-                self.unreadable += 1
         return messages

@@ -51,7 +51,6 @@ class ShownTopics:
             left.discard(client.id)
             if not left:
                 self._viewers.pop(channel.topic, None)
-        self._wake()
 
     def take(self) -> tuple[set[str], set[str]]:
         """Return the topics with any viewer, and those with a new viewer since the last call."""

@@ -223,8 +223,6 @@ def _write(files: Mapping[Path, tuple[bytes, int]]) -> None:
     try:
         for path, (data, mode) in files.items():
             replace(path, data, mode=mode, owner=(os.geteuid(), os.getegid()))
-    except PermissionError:
-        raise
     except OSError as error:
         raise MendableError(
             f"cannot write {path}: {error.strerror}; the key and its certificate belong together, "

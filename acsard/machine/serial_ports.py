@@ -46,8 +46,7 @@ def serial_devices() -> list[SerialDevice]:
     links = _links()
     devices = []
     for port in sorted(list_ports.comports(), key=lambda p: str(p.device)):
-        usb = port.vid is not None and port.pid is not None
-        usb_id = f"{port.vid:04x}:{port.pid:04x}" if usb else ""
+        usb_id = "" if port.vid is None else f"{port.vid:04x}:{port.pid:04x}"
         devices.append(
             SerialDevice(
                 device=port.device,

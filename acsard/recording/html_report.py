@@ -286,7 +286,7 @@ def _summary(drawing: Drawing) -> str:
         if drawing.driving_s
         else f"did not drive in the recorded {lasting(seconds)}"
     )
-    worst = sorted(drawing.counts.items(), key=lambda item: (-item[0][0], item[0][1]))
+    worst = sorted(drawing.counts.items(), key=lambda item: -item[0][0])
     events = [
         f"{name.replace('_', ' ')} ({count})"
         for (level, name), count in worst

@@ -52,6 +52,7 @@ HOST = re.compile(r"([A-Za-z0-9.-]{1,253}|\[[0-9A-Fa-f:.]{2,45}\])(:[0-9]{1,5})?
 STATUS_REASONS: dict[int, Reason] = {404: "path", 405: "path", 413: "too_big"}
 
 STATUS_TEXTS = {
+    400: "this address is a WebSocket: connect to it with ws:// or wss://",
     404: "this address does not exist; GET /api lists all addresses",
     413: f"the request has more than {MAX_MESSAGE_BYTES} bytes: send less",
 }

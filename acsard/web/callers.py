@@ -183,10 +183,7 @@ def network_of(address: str) -> str:
     """
     if ":" not in address:
         return address
-    try:
-        return str(ipaddress.ip_network((address.partition("%")[0], 64), strict=False))
-    except ValueError:
-        return address
+    return str(ipaddress.ip_network((address.partition("%")[0], 64), strict=False))
 
 
 def is_loopback(text: str) -> bool:

@@ -159,8 +159,6 @@ class Outgoing:
 
         If it were cut at once, many clients would report a network failure instead of the reason.
         """
-        if self._closing:
-            return
         self._closing = True
         # Cut off a client that does not answer the close frame in time.
         asyncio.get_running_loop().call_later(1.0, cut, self._transport)

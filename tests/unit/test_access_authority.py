@@ -5,15 +5,20 @@ OpenSSL checks this in the tests.
 
 from __future__ import annotations
 
+import os
 import ssl
+import tempfile
 from contextlib import suppress
 from pathlib import Path
 
 import pytest
 from cryptography import x509
-from cryptography.hazmat.primitives.asymmetric import ec
+from cryptography.hazmat.primitives import serialization
+from cryptography.hazmat.primitives.asymmetric import ec, ed25519
 
+from acsard.host.errors import MendableError
 from acsard.machine.authority import Authority
+from acsard.machine.certificates import CA_KEY
 from tests.each import each
 
 OWN = ["robot1", "robot.example", "203.0.113.9", "2001:db8:1:2::9"]
@@ -80,3 +85,29 @@ def test_an_authority_of_another_program_without_constraints_may_sign_for_any_na
     certificate = x509.load_pem_x509_certificate((tmp_path / "certificate.pem").read_bytes())
     key = ec.generate_private_key(ec.SECP256R1())
     assert Authority(certificate, key).permits("bank.example")
+
+
+def test_an_authority_whose_key_is_of_another_kind_is_refused(tmp_path: Path) -> None:
+    Authority.make(tmp_path, "test", 1)
+    other = ed25519.Ed25519PrivateKey.generate()
+    (tmp_path / CA_KEY).write_bytes(
+        other.private_bytes(
+            serialization.Encoding.PEM,
+            serialization.PrivateFormat.PKCS8,
+            serialization.NoEncryption(),
+        )
+    )
+    with pytest.raises(ValueError, match=r"ca-key\.pem is not a P-256 key"):
+        Authority.load(tmp_path)
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="needs root, to become a user without permission")
+def test_a_directory_that_refuses_a_file_is_named_with_the_remedy() -> None:
+    with tempfile.TemporaryDirectory() as where:
+        os.chmod(where, 0o755)
+        os.seteuid(65534)
+        try:
+            with pytest.raises(MendableError, match=r"cannot write .*: Permission denied; .* run "):
+                Authority.make(Path(where), "test", 1)
+        finally:
+            os.seteuid(0)

@@ -19,10 +19,14 @@ from cryptography.hazmat.primitives.serialization import (
     load_pem_private_key,
 )
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
+from msgspec.structs import replace
 
 from acsard.cli import main
 from acsard.core.config.parsing import parse
+from acsard.core.config.settings import Config
 from acsard.host.own_identity import own_addresses
+from acsard.machine.certificates import port
+from tests.each import each
 
 ROLES = ("viewer", "operator", "maintainer")
 
@@ -97,6 +101,30 @@ def test_init_makes_an_authority_and_a_certificate_for_the_robot_and_each_role(m
     host = os.uname().nodename
     names = {host, f"{host}.local", "localhost", "robot.example", "127.0.0.1", "192.0.2.7"}
     assert names | {"2001:db8::7", *own_addresses()} <= names_of(made)
+
+
+def test_a_file_in_the_place_of_the_directory_is_named(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "tls").touch()
+    for below in ("tls", "tls/robot"):
+        assert tls("init", "--directory", str(tmp_path / below)) == 1
+        assert f"{tmp_path / 'tls'} is not a directory; name a" in capsys.readouterr().err
+
+
+@each(
+    ("listen", "expected"),
+    [
+        ((), "7449"),
+        (("tcp/127.0.0.1:7448",), "7449"),
+        (("tcp/127.0.0.1:7448", "tls/[::]:7999", "tls/0.0.0.0:8000"), "7999"),
+    ],
+)
+def test_a_client_connects_to_the_first_port_with_tls(
+    listen: tuple[str, ...], expected: str
+) -> None:
+    config = Config()
+    assert port(replace(config, bus=replace(config.bus, listen=listen))) == expected
 
 
 def test_the_authority_signs_certificates_and_nothing_below_it_does(made: Path) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import json
+import os
 import stat
 import time
 from pathlib import Path
@@ -13,7 +14,7 @@ import pytest
 from acsard.cli import main
 from acsard.core.values import Role
 from acsard.host import clock
-from acsard.host.errors import MendableError, UsageError
+from acsard.host.errors import MendableError, NotPermittedError, UsageError
 from acsard.machine.authority import Authority
 from acsard.web import tokens
 from acsard.web.callers import AdmittedClient
@@ -228,3 +229,13 @@ def test_the_link_of_an_invitation_and_the_list_say_how_long_it_lasts(
     assert main(["web", "tokens"]) == 0
     rows = capsys.readouterr().out.splitlines()
     assert [row.rpartition(", ")[2] for row in rows] == ["1 h left", "30 d left"]
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="needs root, to become a user without permission")
+def test_a_user_who_may_not_write_the_tokens_is_told_to_use_sudo(tmp_path: Path) -> None:
+    os.seteuid(65534)
+    try:
+        with pytest.raises(NotPermittedError, match="with sudo"):
+            Vault(tmp_path / "state", "acsar").invite("viewer", "tv", 1)
+    finally:
+        os.seteuid(0)

@@ -185,6 +185,7 @@ class Blocking(Robot):
     [
         (0.0, 0.5, "reply_times_even"),
         (0.01, 0.5, "reply_times_even"),
+        (0.015, 0.1, "reply_times_even"),  # each tenth reply, but no longer than two periods
         (0.08, 0.5, "reply_times_bunched"),
         # Most gaps are those inside a bunch.
         (0.06, 0.1, "reply_times_bunched"),

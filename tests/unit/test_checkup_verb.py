@@ -192,8 +192,15 @@ def test_without_questions_only_a_speed_of_the_file_is_driven(
     (tmp_path / "acsard.toml").unlink(missing_ok=True)
     run = MagicMock()
     monkeypatch.setattr(procedure, "run", run)
-    called(tmp_path, "--port", "sim", "--yes", text=f"[limits]\n{text}\n")
+    nothing_judged = called(tmp_path, "--port", "sim", "--yes", text=f"[limits]\n{text}\n")
+    assert nothing_judged == Exit.FAILURE
     assert run.call_args.kwargs == {"fast": fast}
+
+
+def test_findings_of_the_simulator_are_not_written_into_a_robot_s_file(tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match=r"--write cannot change .*/dev/acsar_mcu"):
+        called(tmp_path, "--port", "sim", "--yes", "--write", text=REAL)
+    assert (tmp_path / "acsard.toml").read_text() == REAL
 
 
 def on_terminal(columns: int, do: Callable[[], object], monkeypatch: pytest.MonkeyPatch) -> str:

@@ -19,12 +19,15 @@ from acsard.cli.command_line import VERBS
 from acsard.cli.move import _parsed
 from acsard.cli.robot_options import Silence
 from acsard.client.follower import FIRST_STATE_TIMEOUT_S
+from acsard.client.identity import ClientIdentity
+from acsard.core.messages.schema import ServiceReply
 from acsard.core.values import Pose
 from acsard.host import errors
 from acsard.host.errors import (
     MendableError,
     UsageError,
 )
+from acsard.top import terminal
 from tests.each import each
 from tests.unit.screens import STATE
 
@@ -140,6 +143,77 @@ def test_ways_are_metres_and_degrees_in_their_directions() -> None:
 def test_other_words_are_refused_with_an_example(words: str) -> None:
     with pytest.raises(UsageError, match="acsard move forward 1 left 90"):
         _parsed(words.split())
+
+
+class Called:
+    """A robot that takes every call."""
+
+    def __init__(self) -> None:
+        self.calls: list[tuple[str, dict[str, object]]] = []
+
+    def __enter__(self) -> Called:
+        return self
+
+    def __exit__(self, *_: object) -> None: ...
+
+    def call(self, verb: str, **fields: object) -> ServiceReply:
+        self.calls.append((verb, fields))
+        return ServiceReply(True, "done")
+
+
+@each(
+    ("words", "fields"),
+    [
+        ("clear", {}),
+        ("clear 7 9007199254740991", {"numbers": [7, (1 << 53) - 1]}),
+        ("activate 0", {"numbers": [0]}),
+        ("set_pose 1 -2 3", {"x": 1.0, "y": -2.0, "yaw": 3.0}),
+    ],
+)
+def test_a_call_has_the_numbers_that_were_typed(
+    words: str, fields: dict[str, object], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    robot = Called()
+    monkeypatch.setattr(robot_options, "open_connection", lambda *_, **__: robot)
+    assert main(["call", *words.split()]) == 0
+    assert robot.calls == [(words.split()[0], fields)]
+
+
+@each(
+    ("words", "why"),
+    [
+        ("clear 9007199254740992", "is not the number of a cause"),
+        ("clear 0.5", "is not the number of a cause"),
+        ("clear -1", "is not the number of a cause"),
+        ("set_pose 1 2", "acsard call set_pose X Y YAW"),
+        ("set_pose 1 2 nan", "YAW = nan: the number must be finite"),
+        ("set 1", "a setting is changed with `acsard set KEY VALUE`"),
+    ],
+)
+def test_a_call_with_other_numbers_is_refused_before_it_is_sent(
+    words: str,
+    why: str,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.setattr(robot_options, "open_connection", lambda *_, **__: pytest.fail("sent"))
+    assert main(["call", *words.split()]) == 2
+    assert why in capsys.readouterr().err
+
+
+@each(("role", "code"), [("viewer", 77), ("", 69)])
+def test_a_keyboard_whose_certificate_may_not_drive_is_refused_before_the_screen_opens(
+    role: Any, code: int, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    us = ClientIdentity(role, "ann", "0123")
+    robot = SimpleNamespace(where=SimpleNamespace(tls="tls"), whoami=lambda: us)
+    monkeypatch.setattr(robot_options, "open_connection", lambda *_, **__: nullcontext(robot))
+    monkeypatch.setenv("TERM", "xterm")
+    for stream in (sys.stdin, sys.stdout):
+        monkeypatch.setattr(stream, "isatty", lambda: True)
+    monkeypatch.setattr(terminal, "drive", lambda _: pytest.fail("the screen opened"))
+    assert main(["drive"]) == code
+    assert us.describe() in capsys.readouterr().err
 
 
 def test_an_interrupted_drive_prints_how_far_it_came_and_what_is_wrong(

@@ -16,13 +16,14 @@ from acsard.cli.check import main
 from acsard.cli.common import load, overrides, with_record_directory
 from acsard.cli.robot_options import require_readable, robot_address
 from acsard.core.config.parsing import parse
-from acsard.core.config.settings import Config, McuConfig, WebConfig
+from acsard.core.config.settings import BusConfig, Config, McuConfig, WebConfig
 from acsard.host import config_file
 from acsard.host.config_file import SEARCH_PATHS, find
 from acsard.host.errors import CertificateError, Exit, MendableError, UsageError
 from acsard.host.version import version
 from acsard.machine.authority import Authority
 from acsard.machine.examination import OPTION_KEYS
+from tests.system.typed import typed
 
 DEFAULTS = "built-in defaults"
 
@@ -231,8 +232,8 @@ def test_each_option_sets_its_key_and_no_other_and_the_doctor_knows_them() -> No
         ("--connect", "tcp/[::1]:2"): ("bus.connect", ["tcp/[::1]:2"]),
     }
     assert given_by(()) == {}
-    for typed, (key, value) in words.items():
-        assert given_by(typed) == {key: value}
+    for options, (key, value) in words.items():
+        assert given_by(options) == {key: value}
         assert parse(b"", {key.partition(".")[0]: {key.partition(".")[2]: value}}) != Config()
     assert {key for key, _ in words.values()} == set(OPTION_KEYS)
 
@@ -256,14 +257,34 @@ def test_the_banner_has_the_approved_words(approved: Callable[[Path, str], None]
     approved(Path(__file__).with_name("words") / "banner.txt", text.replace(version(), "VERSION"))
 
 
+def test_the_banner_names_the_router_of_a_robot_that_listens_nowhere() -> None:
+    bus = BusConfig(mode="client", connect=("tcp/r:7447",))
+    text = run.banner(Config(bus=bus), "x.toml", "/dev/x")
+    assert "bus     client of the Zenoh router at tcp/r:7447, keys " in text
+
+
 def test_on_a_terminal_the_page_is_served_unless_it_is_disabled_or_missing(
-    monkeypatch: pytest.MonkeyPatch,
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     monkeypatch.delenv("INVOCATION_ID", raising=False)
     monkeypatch.setattr(sys.stdout, "isatty", lambda: True)
-    words = run.page(Config(), "nowhere.toml")
-    assert words is not None
-    assert words[:3] == ["web", "--id", "acsar"]
+    file = tmp_path / "acsard.toml"
+    where = ["--connect", "tcp/127.0.0.1:7448"]
+    assert run.page(Config(), str(file)) == ["web", "--id", "acsar", *where]
+    file.touch()
+    named = ["--config", str(file)]
+    assert run.page(Config(), str(file)) == ["web", "--id", "acsar", *named, *where]
     assert run.page(Config(web=WebConfig(page=False)), "nowhere.toml") is None
     monkeypatch.setattr(run, "find_spec", lambda name: None)  # as if the extra were not installed
     assert run.page(Config(), "nowhere.toml") is None
+
+
+def test_without_a_file_the_defaults_are_printed_and_are_no_mistake(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.delenv("ACSARD_CONFIG", raising=False)
+    monkeypatch.setattr("acsard.host.config_file.SEARCH_PATHS", ())
+    result = typed("check")
+    assert (result.code, result.err) == (0, f"{DEFAULTS}: no mistakes, no warnings")
+    assert result.out.startswith(f"# effective configuration from {DEFAULTS}\n")

@@ -11,22 +11,37 @@ import socket
 import stat
 import subprocess
 import sys
+from collections.abc import Iterable
+from contextlib import nullcontext
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 from msgspec.structs import replace
 
 from acsard.bus.address import Address
+from acsard.client.identity import ClientIdentity
+from acsard.core.config.parsing import effective
 from acsard.core.config.settings import BusConfig, Config, McuConfig
 from acsard.core.messages.encodings import DecodeError
-from acsard.core.messages.schema import DiagnosticStatus, Info, KeyValue
+from acsard.core.messages.schema import DiagnosticStatus, Info, KeyValue, Time
 from acsard.daemon.serial.device import refusal
-from acsard.host import real_time
+from acsard.host import clock, real_time
 from acsard.host.errors import CertificateError, NoAnswerError
 from acsard.host.kernel_counters import Kernel
 from acsard.machine import examination, versions
 from acsard.machine.authority import Authority
-from acsard.machine.examination import Running, clocks, compared, examine, reported, routers
+from acsard.machine.examination import (
+    Running,
+    clocks,
+    compared,
+    examine,
+    gateway,
+    query_or_finding,
+    reported,
+    routers,
+)
 from acsard.machine.finding import Finding
 from acsard.machine.local_findings import scheduling, serial_port, slowness, unused_version
 from acsard.machine.serial_ports import BOARDS
@@ -57,6 +72,39 @@ def test_a_reason_of_two_reports_is_printed_once_where_it_is_not_ok() -> None:
         Finding("serial link", "received_nothing", "failure", "down: nothing came", "check"),
         Finding("recording", "", "ok", "on"),
     ]
+    (alone,) = reported((waits,))
+    assert (alone.subject, alone.code) == ("mode", "received_nothing")
+
+
+class Answering:
+    """A daemon whose clock is ahead of this computer's by this time, s."""
+
+    def __init__(self, ahead_s: float) -> None:
+        self._ahead_s = ahead_s
+
+    def get(self, key: str) -> Any:
+        now_ns = clock.now().wall_ns + round(self._ahead_s * 1e9)
+        answers = {
+            "info": INFO, "config": effective(FILE), "diagnostics": SimpleNamespace(status=[]),
+            "state": SimpleNamespace(stamp=Time.from_ns(now_ns)),
+        }  # fmt: skip
+        return answers[key]
+
+    def whoami(self) -> ClientIdentity:
+        return ClientIdentity("maintainer", "", "0123")
+
+
+@pytest.mark.parametrize("ahead_s", [0.0, 5.0, -3600.0])
+def test_the_clock_of_a_daemon_is_compared_by_the_time_of_its_answer(
+    ahead_s: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    robot = nullcontext(Answering(ahead_s))
+    monkeypatch.setattr(examination, "open_connection", lambda _: robot)
+    found = examination.query(FILE, Address("tcp/127.0.0.1:1", "acsar", ""))
+    assert 0.0 <= found.round_trip_s < 1.0
+    assert abs(found.ahead_s - ahead_s) <= found.round_trip_s
+    assert (found.config, found.info) == (FILE, INFO)
+    assert codes(clocks(found)) == ["clock_apart"] * bool(ahead_s)
 
 
 def test_each_remedy_is_said_once() -> None:
@@ -247,6 +295,70 @@ def test_a_program_that_uses_the_port_in_place_of_the_daemon_is_a_failure() -> N
     assert used.mend == "end that program, unless it belongs to your simulator of the board"
 
 
+def codes(findings: Iterable[Finding]) -> list[str]:
+    return [finding.code for finding in findings]
+
+
+def test_the_simulator_needs_no_port_and_a_file_is_none(tmp_path: Path) -> None:
+    file = tmp_path / "port"
+    file.touch()
+    assert codes(serial_port("sim", simulated=True)) == ["port_simulated"]
+    assert codes(serial_port("sim", simulated=False)) == []
+    assert codes(serial_port(str(file), simulated=False)) == ["port_not_serial"]
+    assert codes(serial_port(str(tmp_path / "none"), simulated=False)) == ["port_missing"]
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="root has a port that another user may not open")
+def test_a_port_that_this_user_may_not_open_is_named_with_the_remedy() -> None:
+    board, port = pty.openpty()
+    try:
+        os.setresuid(65534, 65534, 0)
+        try:
+            first = next(serial_port(os.ttyname(port), simulated=False))
+        finally:
+            os.setresuid(0, 0, 0)
+    finally:
+        for end in (board, port):
+            os.close(end)
+    assert (first.code, first.level) == ("port_denied", "failure")
+    assert first.mend
+
+
+def test_a_router_a_gateway_and_a_daemon_are_looked_for_where_they_should_listen() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        here = f"127.0.0.1:{server.getsockname()[1]}"
+        with socket.create_server(("127.0.0.1", 0)) as closed:
+            nowhere = f"127.0.0.1:{closed.getsockname()[1]}"
+        both = [f"tls/{here}", f"tls/{nowhere}"]
+        bus = BusConfig(listen=("tcp/127.0.0.1:1", *both))
+        assert codes(gateway(replace(FILE, bus=bus))) == ["gateway_open", "gateway_absent"]
+        config = replace(FILE, bus=BusConfig(connect=tuple(both)))
+        (absent,) = routers(config, running=False)
+        assert (absent.code, nowhere in absent.text) == ("router_absent", True)
+        assert codes(routers(config, running=True)) == []
+    for bus, code in (
+        (BusConfig(), "daemon_absent"),
+        (BusConfig(connect=(f"tcp/{nowhere}",)), "daemon_absent"),
+        (BusConfig(mode="client", connect=(f"tcp/{nowhere}",)), "daemon_behind_router"),
+    ):
+        at = Address(f"tcp/{nowhere}", "acsar", "")
+        found = query_or_finding(replace(FILE, bus=bus), at)
+        assert isinstance(found, Finding)
+        assert found.code == code
+
+
+def test_a_setting_with_a_surprising_effect_is_a_warning_also_without_a_daemon() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as closed:
+        nowhere = f"tcp/127.0.0.1:{closed.getsockname()[1]}"
+    text = b"commands.sources = []\n[mcu]\nport = '/dev/none'\n"
+    found = list(examine("x", text, {}, lambda _: Address(nowhere, "acsar", "")))
+    (doubtful,) = [one for one in found if one.code == "configuration_doubtful"]
+    assert "no program can drive this robot" in doubtful.text
+    assert doubtful.level == "warning"
+    assert "port_missing" in codes(found)
+    assert "port_simulated" not in codes(found)
+
+
 def test_without_real_time_in_the_configuration_no_warning_is_given() -> None:
     (finding,) = scheduling(False, 77)
     assert finding.level == "ok"
@@ -254,6 +366,7 @@ def test_without_real_time_in_the_configuration_no_warning_is_given() -> None:
 
 def test_each_present_cause_of_lateness_is_a_warning_with_a_remedy(tmp_path: Path) -> None:
     files = {HWMON + "in0_lcrit_alarm": "1\n", POLICY + "scaling_governor": "powersave\n"}
+    assert codes(slowness(Kernel(write(tmp_path, QUIET)))) == ["computer_well"]
     findings = list(slowness(Kernel(write(tmp_path, QUIET | files))))
     assert [finding.level for finding in findings] == ["warning", "warning"]
     assert "supply voltage is too low" in findings[0].text

@@ -2,10 +2,16 @@
 
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
+from collections.abc import Iterable, Iterator
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 import pytest
 
+from acsard.core.values import NS_PER_S
 from acsard.host.kernel_counters import Conditions, Kernel, Reading, SlowClock, slow_clock
 from acsard.machine import local_findings
 from tests.unit.kernel_files import COOLER, COUNT, FIRMWARE, HWMON, POLICY, QUIET, write
@@ -65,6 +71,51 @@ def test_a_clock_is_slow_if_its_limit_is_far_below_the_full_clock(
     assert result == (None if limit is None else SlowClock(governor, limit, 1500))
 
 
+@pytest.mark.parametrize(
+    ("later", "taken"),
+    # In ticks of 10 ms: of each processor for the host of the virtual machine, since its start.
+    [((18419, 19567), False), ((18421, 19567), False), ((18419, 19578), True), ((18430,), True)],
+)
+def test_a_host_that_takes_a_processor_of_the_virtual_machine_is_named(
+    later: tuple[int, ...], taken: bool, tmp_path: Path
+) -> None:
+    kernel = Kernel(write(tmp_path, QUIET))
+    before = kernel.read()
+    rows = [
+        f"cpu{n} 4563760 1967646 673613 1415998 7026 0 17675 {k} 0 0" for n, k in enumerate(later)
+    ]
+    write(tmp_path, {"proc/stat": "\n".join(["cpu  0 0 0 0 0 0 0 0 0 0", *rows])})
+    causes = local_findings.slowdowns(before, kernel.read(), 2 * NS_PER_S)
+    assert [cause.code for cause in causes] == ["computer_steal"] * taken
+    assert all("0.11 s" in cause.text for cause in causes)
+
+
+@pytest.mark.parametrize("later", [{}, {COUNT: "3\n"}, {COOLER + "cur_state": "2\n"}])
+def test_a_processor_that_became_hot_between_two_looks_is_named(
+    later: dict[str, str], tmp_path: Path
+) -> None:
+    kernel = Kernel(write(tmp_path, QUIET))
+    before = kernel.read()
+    write(tmp_path, later)
+    causes = local_findings.slowdowns(before, kernel.read(), NS_PER_S)
+    assert [cause.code for cause in causes] == ["computer_hot"] * bool(later)
+
+
+@contextmanager
+def running(where: Path, names: Iterable[str]) -> Iterator[None]:
+    """Run a process of each of these names, and put it into the directory `proc`."""
+    with ExitStack() as programs:
+        for name in names:
+            (where / name).symlink_to(os.path.realpath(sys.executable))
+            begun = "import sys; print(flush=True); sys.stdin.read()"
+            words, pipe = [str(where / name), "-I", "-S", "-c", begun], subprocess.PIPE
+            program = programs.enter_context(subprocess.Popen(words, stdin=pipe, stdout=pipe))
+            assert program.stdout is not None
+            program.stdout.readline()  # before it, the kernel may not have named the process yet
+            (where / "proc" / str(program.pid)).symlink_to(f"/proc/{program.pid}")
+        yield
+
+
 @pytest.mark.parametrize("ruled", [False, True])
 @pytest.mark.parametrize(
     "programs", [{"brltty"}, {"ModemManager"}, {"brltty", "ModemManager"}, set()]
@@ -75,8 +126,11 @@ def test_programs_that_take_serial_ports_are_named_unless_a_rule_keeps_them_off(
     rules = tmp_path / "70-acsar.rules"
     if ruled:
         rules.touch()
+    (tmp_path / "proc").mkdir()
+    # The other processes of this computer are none of the test.
+    monkeypatch.setattr("acsard.host.processes.PROC", tmp_path / "proc")
     monkeypatch.setattr(local_findings, "UDEV_RULES", (str(rules),))
-    monkeypatch.setattr(local_findings, "is_running", programs.__contains__)
-    named = {each.code for each in local_findings.port_grabbers()}
+    with running(tmp_path, programs):
+        named = {each.code for each in local_findings.port_grabbers()}
     kept_off = {"ModemManager"} if ruled else set()
-    assert named == {f"{name.lower()}_running" for name in programs - kept_off - {"x"}}
+    assert named == {f"{name.lower()}_running" for name in programs - kept_off}

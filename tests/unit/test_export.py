@@ -6,6 +6,7 @@ The tests also cover an export to the path of an existing file.
 from __future__ import annotations
 
 import io
+import os
 from pathlib import Path
 from typing import Any
 
@@ -70,6 +71,7 @@ def test_the_mcap_library_finds_the_export_finished_indexed_and_compressed(
     count = export(Recording([path]), new, "mcap", config)
     with new.open("rb") as stream:
         reader = make_reader(stream)
+        assert reader.get_header().profile == "ros2"
         summary = reader.get_summary()
         assert summary is not None
         assert summary.statistics is not None
@@ -141,6 +143,17 @@ def test_a_directory_a_device_and_a_recording_are_never_replaced(name: str, tmp_
     before = {*tmp_path.iterdir()}
     with pytest.raises(FileExistsError), replacing(tmp_path / name, force=True):
         raise AssertionError
+    assert {*tmp_path.iterdir()} == before
+
+
+def test_only_a_file_is_ever_replaced(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe")
+    (tmp_path / "link").symlink_to(tmp_path / "not mounted")
+    (tmp_path / "directory").mkdir()
+    before = {*tmp_path.iterdir()}
+    for name in ("pipe", "link", "directory"):
+        with pytest.raises(FileExistsError), replacing(tmp_path / name, force=True):
+            raise AssertionError
     assert {*tmp_path.iterdir()} == before
 
 

@@ -2,17 +2,24 @@
 
 from __future__ import annotations
 
+import os
+import socket
 import sys
+from collections import deque
 from collections.abc import Callable
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
 
 import pytest
 import zenoh
+from foxglove import Context
 from msgspec.structs import replace
 
+from acsard.bus.address import Address
 from acsard.client import connection
 from acsard.client.connection import Connection
+from acsard.core.config.parsing import effective
 from acsard.core.config.settings import Config, RosConfig
 from acsard.core.messages.schema import (
     Events,
@@ -21,13 +28,16 @@ from acsard.core.messages.schema import (
 )
 from acsard.core.messages.signature import public_name
 from acsard.core.ros.names import full_name
-from acsard.core.values import NS_PER_S
+from acsard.core.values import NS_PER_S, Role
 from acsard.foxglove import bridge as module
 from acsard.foxglove.bridge import Bridge
+from acsard.foxglove.bridge import configuration as module_configuration
 from acsard.foxglove.relay import EventDeduplicator
+from acsard.foxglove.server import ShownTopics, start
 from acsard.host import clock
-from acsard.host.errors import ReplyError
+from acsard.host.errors import InUseError, NotPermittedError, ReplyError
 from tests.each import each
+from tests.unit.screens import raw_sample, sample_of
 
 UNREADABLE = ReplyError("cannot read the robot's state; use the same version here")
 
@@ -117,8 +127,10 @@ def test_the_log_has_a_viewer_s_call_under_a_readable_name(
     assert name == "alice@laptop acsard foxglove"
 
 
-@each("key", ["diagnostics", "tf_static", "state"])
-def test_a_late_viewer_gets_the_last_message_of_a_rare_key(world: World, key: str) -> None:
+@each(("key", "again"), [("diagnostics", 1), ("tf_static", 1), ("state", 1), ("odom", 0)])
+def test_a_late_viewer_gets_the_last_message_of_a_rare_key(
+    world: World, key: str, again: int
+) -> None:
     relay = world.bridge._relay
     logged: list[bytes] = []
     topic = full_name(world.namespace, key)
@@ -130,7 +142,115 @@ def test_a_late_viewer_gets_the_last_message_of_a_rare_key(world: World, key: st
     relay.follow({topic}, set())
     assert logged == []
     relay.follow({topic}, {topic})
-    assert logged == [b"the last one"]
+    assert logged == [b"the last one"] * again
+
+
+def test_a_late_viewer_of_the_log_gets_the_last_events_too(world: World) -> None:
+    relay, answers, logged = world.bridge._relay, deque[Any](), list[bytes]()
+    topic = full_name(world.namespace, "log")
+    stream: Any = SimpleNamespace(
+        put=answers.append,
+        try_recv=lambda: answers.popleft() if answers else None,
+        undeclare=lambda: None,
+    )
+    relay._followed["events"] = stream
+    relay._robot.start_query = lambda key, take: take(sample_of(events(3)))  # type: ignore[method-assign, assignment]
+    relay._outs[topic].channel = cast("Any", SimpleNamespace(log=logged.append))
+    for viewers in (1, 2):
+        relay.follow({topic}, {topic})
+        relay.forward()
+        assert len(logged) == 3 * viewers
+    relay.follow({topic}, set())
+    answers.extend([raw_sample(b"{"), sample_of(events(4))])
+    relay.forward()
+    assert len(logged) == 7
+    assert b"mode3" in logged[-1]
+
+
+class Asked:
+    """A robot behind TLS, or on this machine, that answers a client of this role."""
+
+    def __init__(self, tls: str, role: Role, tables: object) -> None:
+        self.where, self._role, self._tables = Address("tls/r:7449", "acsar", tls), role, tables
+
+    def whoami(self) -> Any:
+        return SimpleNamespace(role=self._role)
+
+    def get(self, key: str) -> object:
+        assert (key, self._role) != ("config", "viewer") or not self.where.tls
+        return self._tables
+
+
+TABLES = effective(Config(ros=RosConfig(namespace="robot1")))
+
+
+@each(
+    ("tls", "role", "namespace"),
+    [("tls", "viewer", ""), ("tls", "maintainer", "robot1"), ("", "viewer", "robot1")],
+)
+def test_the_namespace_of_a_robot_is_used_if_this_program_may_read_it(
+    tls: str, role: Role, namespace: str
+) -> None:
+    asked: Any = Asked(tls, role, TABLES)
+    assert module_configuration(asked).ros.namespace == namespace
+
+
+def test_a_configuration_of_another_version_is_refused_with_the_remedy() -> None:
+    asked: Any = Asked("", "maintainer", {"ros": {"namespace": 5}})
+    with pytest.raises(ReplyError, match="is the daemon a different version"):
+        module_configuration(asked)
+
+
+def test_a_topic_is_shown_until_its_last_viewer_has_gone() -> None:
+    shown, channel = ShownTopics(lambda: None), cast(Any, SimpleNamespace(topic="/odom"))
+    first, second = (cast(Any, SimpleNamespace(id=number)) for number in (1, 2))
+    for client in (first, second):
+        shown.on_subscribe(client, channel)
+        assert shown.take() == ({"/odom"}, {"/odom"})
+    shown.on_unsubscribe(first, channel)
+    assert shown.take() == ({"/odom"}, set())
+    shown.on_unsubscribe(second, channel)
+    assert shown.take() == (set(), set())
+
+
+def plain_ports_begin() -> int:
+    return int(Path("/proc/sys/net/ipv4/ip_unprivileged_port_start").read_text())
+
+
+@pytest.mark.skipif(plain_ports_begin() < 2, reason="each user may use each port here")
+def test_a_port_that_needs_root_is_refused_with_another_one() -> None:
+    robot: Any = SimpleNamespace(where=Address("tcp/127.0.0.1:1", "acsar", ""))
+    port, user = plain_ports_begin() - 1, os.geteuid()
+    if user == 0:
+        os.seteuid(65534)
+    try:
+        with pytest.raises(
+            NotPermittedError, match=r"use a port above 1023: --address 127\.0\.0\.1:1024"
+        ):
+            start(robot, RosConfig(), ("127.0.0.1", port), ShownTopics(lambda: None), Context())
+    finally:
+        os.seteuid(user)
+
+
+def test_a_port_of_another_viewer_is_refused_with_another_one() -> None:
+    robot: Any = SimpleNamespace(where=Address("tcp/127.0.0.1:1", "acsar", ""))
+    with socket.create_server(("127.0.0.1", 0)) as other:
+        at = ("127.0.0.1", other.getsockname()[1])
+        with pytest.raises(InUseError, match=rf"cannot listen on .*:{at[1]}: .* --address "):
+            start(robot, RosConfig(), at, ShownTopics(lambda: None), Context())
+
+
+def test_each_end_of_the_daemon_is_reported_and_its_first_start_is_not(world: World) -> None:
+    world.daemon(zenoh.SampleKind.PUT)
+    world.passes(1.0)
+    assert (world.printed, world.queries) == ([], 0)
+    for _ in range(2):
+        world.daemon(zenoh.SampleKind.DELETE)
+        world.passes(1.0)
+        world.daemon(zenoh.SampleKind.PUT)
+        world.passes(3.0)
+    assert world.printed == [GONE, BACK] * 2
+    assert world.server.shown == [GONE, "without daemon"] * 2
 
 
 def test_an_unreadable_daemon_is_queried_once_a_second_and_reported_once(
@@ -164,13 +284,17 @@ def test_the_configuration_is_read_again_if_the_daemon_restarts_meanwhile(
 
 
 def test_a_viewer_that_comes_while_the_daemon_is_gone_is_told(world: World) -> None:
-    world.daemon(zenoh.SampleKind.DELETE)
-    world.passes(1.0)
-    client, channel = SimpleNamespace(id=1), SimpleNamespace(topic="/odom")
-    world.bridge._shown_topics.on_subscribe(cast(Any, client), cast(Any, channel))
-    world.bridge._relay.follow = lambda *_: None  # type: ignore[method-assign]
-    world.passes(1.0)
-    assert world.server.shown == [GONE, GONE]
+    rounds: list[Any] = []
+    channel = cast(Any, SimpleNamespace(topic="/odom"))
+    world.bridge._relay.follow = lambda *topics: rounds.append(topics)  # type: ignore[method-assign]
+    for number, shown in ((1, []), (2, [GONE, GONE])):
+        world.bridge._shown_topics.on_subscribe(cast(Any, SimpleNamespace(id=number)), channel)
+        world.passes(1.0)
+        assert world.server.shown == shown
+        world.daemon(zenoh.SampleKind.DELETE)
+        world.passes(1.0)
+    assert [fresh for _, fresh in rounds if fresh] == [{"/odom"}] * 2
+    assert all(topics == {"/odom"} for topics, _ in rounds)
 
 
 @pytest.mark.timeout(20)
@@ -218,6 +342,13 @@ def test_an_answer_older_than_the_last_message_reports_no_event() -> None:
     deduplicator.of(events(10))
     assert names(deduplicator, events(9)) == []
     assert names(deduplicator, events(11)) == ["mode10"]
+
+
+def test_a_daemon_that_has_logged_as_much_since_its_restart_is_recognized_by_the_times() -> None:
+    deduplicator = EventDeduplicator()
+    deduplicator.of(events(10))
+    later = [replace(event, stamp=Time(50)) for event in events(10, "second").events]
+    assert len(deduplicator.of(replace(events(10), stamp=Time(60), events=later))) == 10
 
 
 def test_a_restarted_daemon_s_events_are_reported_from_the_first() -> None:

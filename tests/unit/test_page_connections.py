@@ -57,6 +57,16 @@ async def is_open(reader: asyncio.StreamReader) -> bool:
         return True
 
 
+def test_one_name_cannot_take_all_places() -> None:
+    places = Places(5, 2)
+    assert [places.enter(name) for name in "aaabbcd"] == [
+        True, True, False, True, True, True, False
+    ]  # fmt: skip
+    places.leave("b")
+    assert [places.enter(name) for name in "acb"] == [False, True, False]
+    assert places.taken == 5
+
+
 async def test_a_connection_beyond_the_limit_is_closed_and_the_next_has_the_place_of_one_that_left(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -71,8 +81,11 @@ async def test_a_connection_beyond_the_limit_is_closed_and_the_next_has_the_plac
         reader, writer = await asyncio.open_connection(host, port)
         writer.write(b"GET / HTTP/1.1\r\nHost: localhost\r\n\r\n")
         assert (await reader.readline()).split()[1] == b"404"
-        for _, writer in opened:
-            writer.close()
+        late, last = await asyncio.open_connection(host, port)
+        assert not await is_open(late)
+        assert counts.refused() == {"crowded": 2}
+        for _, each in [*opened, (reader, writer), (late, last)]:
+            each.close()
 
 
 NO_BODY = Mock(is_eof=lambda: True)

@@ -45,6 +45,14 @@ async def test_the_recordings_of_another_robot_are_not_shown_as_those_of_this_on
         await box.find(path.name)
 
 
+async def test_a_recording_that_has_just_begun_is_listed(tmp_path: Path) -> None:
+    path = tmp_path / "000001-20261121T070027Z.rec.zst"
+    path.touch()
+    box = BlackBox(robot_with(str(tmp_path)))
+    assert [(row.name, row.bytes) for row in await box.rows()] == [(path.name, 0)]
+    assert await box.find(path.name) == path
+
+
 def robot_with(directory: str) -> Any:
     about = SimpleNamespace(recordings=directory)
     return SimpleNamespace(id="acsar", endpoint="tcp/127.0.0.1:7447", about=about)
@@ -58,3 +66,21 @@ async def test_a_fresh_robot_has_an_empty_list_of_recordings(
     assert await box.rows() == []
     with pytest.raises(RequestRefusedError, match="does not exist"):
         await box.find("000001-20261121T070027Z.rec.zst")
+
+
+async def test_recordings_that_cannot_be_read_are_explained(tmp_path: Path) -> None:
+    file = tmp_path / "record"
+    file.touch()
+    away = robot_with(str(tmp_path))
+    away.endpoint = "tcp/192.168.1.7:7447"
+    for robot, why in ((away, "on another machine"), (robot_with(str(file)), "Not a directory")):
+        for look in (BlackBox(robot).rows(), BlackBox(robot).find("x")):
+            with pytest.raises(TroubleError, match=why):
+                await look
+
+
+def test_a_recording_whose_name_has_no_time_is_listed_without_one(tmp_path: Path) -> None:
+    path = tmp_path / "000001-later.rec.zst"
+    path.touch()
+    (row,) = rows([path, tmp_path / "deleted"])
+    assert (row.begin, row.seconds) == (None, None)

@@ -37,9 +37,10 @@ from acsard.web.followed_robot import (
 from acsard.web.metrics import Counts
 from acsard.web.streams import Stream, Streams
 from tests.system.harness import until
-from tests.unit.screens import INFO, STATE, sample_of
+from tests.unit.screens import INFO, STATE, raw_sample, sample_of
 from tests.unit.test_client_follower import UNREADABLE, Robot
 
+UNREADABLE_BYTES = raw_sample(b"\xff")
 ABOUT = About("1", False, 1.0, 4.0, 10.0, "", {"teleop": 0.25, "app": 0.25})
 
 
@@ -124,6 +125,21 @@ def test_a_daemon_of_another_version_is_reported_as_such(world: World) -> None:
     ((at, reason),) = world.reachability_changes(10.0, lambda t: UNREADABLE)
     assert "another version" in reason
     assert at <= FIRST_STATE_TIMEOUT_S + 2 * PROCESS_PERIOD_S
+
+
+def test_the_messages_that_cannot_be_read_are_counted(world: World) -> None:
+    world.reachability_changes(2.0, lambda t: UNREADABLE if 0.98 < t < 1.22 else world.state())
+    assert world.followed._counts.all() == {"unreadable": 5}
+
+
+async def test_a_stream_keeps_a_message_before_an_answer_and_has_null_for_a_damaged_one() -> None:
+    stream = Stream()
+    assert stream.value()[:2] == (0, b"null")
+    for store, x in ((stream.answered, 1.0), (stream.take, 2.0), (stream.answered, 3.0)):
+        store(sample_of(replace(STATE, x=x)))
+        assert msgspec.json.decode(stream.value()[1])["x"] == min(x, 2.0)
+    stream.take(UNREADABLE_BYTES)
+    assert stream.value()[:2] == (3, b"null")
 
 
 class AnsweringRobot(Robot):

@@ -15,7 +15,7 @@ import pytest
 
 from acsard.bus import certificate_watch
 from acsard.bus.tls_files import KEY
-from acsard.cli import parser, web
+from acsard.cli import main, parser, web
 from acsard.core.config.settings import LogConfig
 from acsard.host.errors import CertificateError, InUseError, UsageError
 from acsard.host.logs import Log
@@ -142,6 +142,19 @@ def test_an_invitation_is_refused_if_the_server_could_not_start(
     assert list(tmp_path.iterdir()) == []
 
 
+def test_an_invitation_ends_with_the_command_that_revokes_it(
+    tls: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("STATE_DIRECTORY", str(tmp_path / "state"))
+    address = ["--address", "https://0.0.0.0:8443"]
+    assert main(["web", "--tls", tls, *address, "invite", "viewer", "--name", "tv"]) == 0
+    *_, command = capsys.readouterr().out.strip().splitlines()
+    words = command.partition("acsard ")[2].split()
+    assert main(words) == 0
+    assert capsys.readouterr().out == "tv is revoked\n"
+    assert Vault(tmp_path / "state", "acsar").all() == []
+
+
 async def test_one_thread_waits_for_a_hanging_disk_and_then_everything_is_read_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -176,6 +189,27 @@ async def test_one_thread_waits_for_a_hanging_disk_and_then_everything_is_read_a
     finally:
         reading.cancel()
         log.close()
+
+
+def test_the_page_keeps_its_certificate_until_the_new_one_is_whole_and_then_reports_it_once(
+    tls: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(certificate_watch, "FILES_CHECK_PERIOD_NS", 0)
+    out = io.StringIO()
+    log = Log(LogConfig(), out)
+    certificate, key = Certificate(tls, log), Path(tls) / KEY
+    before, good = certificate.context, key.read_bytes()
+    key.write_bytes(b"damaged")
+    for _ in range(3):
+        certificate.read()
+    assert certificate.context is before
+    key.write_bytes(good)
+    for _ in range(3):
+        certificate.read()
+    assert certificate.context is not before
+    log.close()
+    assert out.getvalue().count("TLS certificate") == 1
+    assert "uses its new TLS certificate and keeps" in out.getvalue()
 
 
 async def test_the_connections_of_a_revoked_token_end_with_the_reading_that_misses_it(

@@ -44,7 +44,7 @@ class Socket:
 async def test_a_beat_is_sent_as_it_arrives_and_ahead_of_everything_that_waits() -> None:
     socket: Any = Socket()
     out = Outgoing(socket, REQUEST, STREAMS, Counts(), "")
-    out.subscribe("beat", 20.0)
+    out.subscribe("beat", 0.1)  # its period would be longer than the test
     stream = out.following["beat"].stream
 
     def arrive(number: int) -> None:
@@ -160,6 +160,16 @@ async def test_an_invalid_message_without_a_stop_is_only_refused() -> None:
     await page.take('{"call": "clear", "id": null}')
     assert page.stops == []
     assert page.counts.refused() == {"malformed": 1}
+
+
+async def test_a_stop_counts_even_after_the_close_frame_and_nothing_else_does() -> None:
+    page = Page("maintainer")
+    page.viewer.end("too fast")
+    for frame in ('{"call": "clear"}', '{"ping": 1}'):
+        await page.take(frame)
+    assert page.stops == []
+    await page.take('{"call": "stop"}')
+    assert len(page.stops) == 1
 
 
 async def test_a_flood_of_messages_leaves_each_other_client_its_turn() -> None:

@@ -6,6 +6,7 @@ import asyncio
 import socket
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager, closing
+from functools import partial
 from pathlib import Path
 from typing import Any, cast
 from unittest.mock import Mock
@@ -17,10 +18,11 @@ from msgspec.structs import replace
 from yarl import URL
 
 from acsard.bus.address import Address
+from acsard.bus.zenoh_sessions import MAX_MESSAGE_BYTES
 from acsard.core.config.settings import WebConfig
 from acsard.web.answers import unsent_bytes
 from acsard.web.app import Page
-from acsard.web.connections import Connections
+from acsard.web.connections import MAX_WAITING_BYTES, Connections
 from acsard.web.followed_robot import About, FollowedRobot
 from acsard.web.metrics import Counts
 from acsard.web.socket_sender import MAX_UNREAD_BYTES
@@ -223,6 +225,15 @@ async def test_a_camera_that_cannot_be_shown_is_explained(
     whole.page.end_all("")
 
 
+async def test_a_camera_at_another_address_is_explained(tmp_path: Path) -> None:
+    with closing(Stream()) as stream:
+        whole = Whole(tmp_path, WebConfig(camera=f"http://127.0.0.1:{stream.port}/other"))
+        async with whole.served() as (url, session), session.get(url / "api/camera") as answer:
+            problem = await answer.json()
+        assert problem["detail"] == "the camera answered 404: correct web.camera"
+        whole.page.end_all("")
+
+
 async def test_no_other_page_can_frame_the_page_or_add_scripts_to_it(whole: Whole) -> None:
     async with whole.served() as (url, session):
         for path in ("", "page/main.js", "api/whoami", "nothing"):
@@ -240,3 +251,129 @@ async def test_a_path_called_with_another_method_names_the_method_it_accepts(who
             assert (await answer.json())["error"] == "this path accepts only POST"
         async with session.post(url / "api/nothing") as answer:
             assert answer.status == 404
+
+
+async def test_an_ordinary_request_for_the_websocket_is_told_what_the_address_is(
+    whole: Whole,
+) -> None:
+    async with whole.served() as (url, session), session.get(url / "ws") as answer:
+        assert answer.status == 400
+        assert "connect to it with ws://" in (await answer.json())["error"]
+
+
+async def test_a_body_that_never_arrives_is_answered_and_named(
+    whole: Whole, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("acsard.web.app.BODY_TIMEOUT_S", 0.1)
+    async with whole.served() as (url, _):
+        reader, writer = await asyncio.open_connection(url.host, url.port)
+        head = "POST /api/srv/clear HTTP/1.1\r\nHost: localhost\r\nContent-Length: 9\r\n\r\n"
+        writer.write(head.encode())
+        async with asyncio.timeout(PATIENCE_S):
+            assert (await reader.readline()).split()[1] == b"408"
+            assert b'"no body arrived within 0.1 s"' in await reader.readuntil(b"}")
+        writer.close()
+
+
+async def test_a_message_beyond_the_limit_ends_its_websocket_and_is_counted_as_too_big(
+    whole: Whole,
+) -> None:
+    async with whole.hands() as ours:
+        await ours.say(call="x" * MAX_MESSAGE_BYTES)
+        await eventually(whole.counts.refused)
+        assert whole.counts.refused() == {"too_big": 1}
+        async with asyncio.timeout(PATIENCE_S):
+            while not ours.socket.closed:
+                await ours.socket.receive()
+
+
+async def test_a_websocket_may_send_more_than_waits_behind_a_request(whole: Whole) -> None:
+    async with whole.hands() as ours:
+        for _ in range(1 + 2 * MAX_WAITING_BYTES // 50_000):
+            await ours.say(subscribe="x" * 50_000)
+        await ours.say(ping=7)
+        await ours.find(lambda frame: frame.get("pong") == 7)
+
+
+async def test_a_bug_of_the_server_is_not_counted_against_the_client(whole: Whole) -> None:
+    whole.robot.about = cast(Any, None)
+    async with whole.served() as (url, session), session.get(url / "metrics") as answer:
+        assert answer.status == 500
+        assert whole.counts.refused() == {}
+
+
+async def test_a_token_that_is_not_json_is_refused_with_the_reason(whole: Whole) -> None:
+    async with whole.served() as (url, session):
+        own = {"Origin": str(url.origin())}
+        async with session.post(url / "token", data=b"{", headers=own) as answer:
+            assert (answer.status, (await answer.json())["error"]) == (
+                400,
+                "send the token as JSON",
+            )
+        assert whole.counts.refused() == {"malformed": 1}
+
+
+async def test_a_message_that_is_not_obeyed_is_answered_with_the_reason(tmp_path: Path) -> None:
+    whole = Whole(tmp_path, WebConfig(local="operator"))
+    wish = {"linear_x": 0.1, "angular_z": 0.0}
+    async with whole.hands() as ours:
+
+        async def answer(key: str) -> Any:
+            return await ours.find(lambda frame: key in frame)
+
+        messages: list[tuple[dict[str, Any], str, str]] = [
+            ({"subscribe": "odometry"}, "subscribe", "is not a key to follow; choose one of"),
+            ({"cmd": wish, "source": "nav"}, "cmd", "is not one of the robot's sources: teleop, "),
+            ({"ping": 1, "call": "stop"}, "message", "exactly one of the fields"),
+        ]
+        for message, kind, words in messages:
+            await ours.say(**message)
+            refused = await answer("refused")
+            assert refused["refused"] == kind
+            assert words in refused["reason"]
+        await ours.find(lambda frame: "answer" in frame)  # the stop
+        await ours.socket.send_bytes(b"{}")
+        await eventually(lambda: whole.counts.refused() == {"malformed": 4})
+        for key in ("odom", "state", "tf", "wheel_states", "battery", "cmd_vel_out"):
+            await ours.say(subscribe=key, rate=50.0)
+        await ours.say(subscribe="events", rate=1.0)
+        assert "300 messages a second: lower some" in (await answer("refused"))["reason"]
+        await ours.say(subscribe="state", rate=10.0)  # another rate of a known key
+        await ours.say(unsubscribe="odom")
+        await ours.say(subscribe="events", rate=1.0)
+        await ours.say(ping=7)
+        assert (await answer("pong"))["pong"] == 7
+        (viewer,) = whole.page._viewers
+        rates = {key: 1.0 / one.period for key, one in viewer._out.following.items()}
+        assert (rates["state"], rates["events"], "odom" in rates) == (10.0, 1.0, False)
+        assert not (await ours.call("set"))["ok"]
+        assert "is not the name of a service" in (await ours.call("no such"))["text"]
+    assert whole.counts.refused() == {"malformed": 5, "role": 1, "too_many": 1}
+
+
+class Driven:
+    """The connection to a daemon, which takes commands."""
+
+    session: Any = None
+
+    def __init__(self) -> None:
+        self.speeds: list[float] = []
+
+    def put(self, twist: Any, *_: object) -> None:
+        self.speeds.append(twist.linear.x)
+
+
+@pytest.mark.parametrize("abrupt", [True, False])
+async def test_a_viewer_that_drives_and_goes_away_leaves_a_zero(whole: Whole, abrupt: bool) -> None:
+    driven = whole.robot.client = cast(Any, Driven())
+    async with whole.hands() as ours:
+        await ours.find(lambda frame: "hello" in frame)
+        for speed in (0.0, 0.5):
+            await ours.drive(speed)
+            await eventually(partial(driven.speeds.__contains__, speed))
+        if abrupt:
+            cast(Any, ours.socket)._response.connection.transport.abort()
+        else:
+            await ours.socket.close()
+        await eventually(lambda: driven.speeds[-1] == 0.0)
+    assert driven.speeds == [0.0, 0.5, 0.0]

@@ -203,6 +203,13 @@ def test_a_bug_in_the_first_step_is_recorded(new: Bench, monkeypatch: pytest.Mon
     assert failure_of(new.end(raised.value)).number == 0
 
 
+def test_a_failed_step_that_cannot_be_written_down_costs_its_inputs_only(bench: Bench) -> None:
+    step = drive().taken[0]
+    bench.recorder.died(step.now, replace(step.heard, missed=1 << 80))
+    paths = bench.end(ZeroDivisionError(BUG))
+    assert failure_of(paths) == Failure(bench.world.steps, f"ZeroDivisionError: {BUG}")
+
+
 class MuteError(Exception):
     def __str__(self) -> str:
         raise ValueError

@@ -71,7 +71,7 @@ def test_the_group_or_every_user_may_read_a_recording(
 class Disk(NamedTuple):
     f_blocks: int
     f_bavail: int
-    f_frsize: int = 1
+    f_frsize: int = 512
 
 
 @pytest.mark.parametrize(
@@ -91,7 +91,8 @@ def test_the_oldest_files_go_and_leave_room(
     files: int, each_mb: int, limit_mb: float, total_mb: float, free_mb: float, kept: int,
     reported: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
 ) -> None:  # fmt: skip
-    monkeypatch.setattr(os, "statvfs", lambda _: Disk(int(total_mb * 1e6), int(free_mb * 1e6)))
+    disk = Disk(int(total_mb * 1e6) // 512, int(free_mb * 1e6) // 512)
+    monkeypatch.setattr(os, "statvfs", lambda _: disk)
     store = new(tmp_path, limit_mb)
     for _ in range(files):
         record(store, size=each_mb * 1_000_000)

@@ -10,7 +10,9 @@ import shutil
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
+from itertools import pairwise
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -136,6 +138,25 @@ def test_a_call_that_fails_is_reported_once_and_costs_steps_that_are_counted(
     box.end()
 
 
+def test_recordings_that_other_programs_pushed_off_the_disk_are_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for number in range(1, 31):
+        path = tmp_path / f"{number:06}-20261121T070027Z{SUFFIX}"
+        path.touch()
+        os.truncate(path, 1_000_000)
+    full = SimpleNamespace(f_blocks=1 << 20, f_bavail=0, f_frsize=4096)
+    monkeypatch.setattr(os, "statvfs", lambda _: full)
+    box = Box(tmp_path, monkeypatch)
+    box.record(2)
+    warning, begun = box.said
+    assert (warning.name, warning.level) == ("recording", "warning")
+    assert "recordings deleted (000001-" in warning.text
+    assert begun.text == f"the daemon records to {tmp_path}"
+    assert 0 < len(listed(tmp_path)) < 12
+    box.recorder.close()
+
+
 def test_a_directory_that_was_removed_is_reported_and_made_again(box: Box) -> None:
     box.record(2)
     shutil.rmtree(box.where)
@@ -168,6 +189,36 @@ def test_steps_that_a_full_disk_refused_are_counted_exactly(room: int, box: Box)
         assert box.trouble.endswith("File too large") == (room < 200_000)
     box.record(7)
     assert box.trouble == ""
+    box.end()
+
+
+def test_each_trouble_of_the_disk_names_the_steps_that_it_cost_itself(box: Box) -> None:
+    for _ in range(2):
+        box.record(2)
+        before = box.recorder.status.missing
+        with files_of_at_most(listed(box.where)[-1].stat().st_size):
+            box.record(2)
+        box.record(recorder.RETRY_ROUNDS + 3)
+        own = box.recorder.status.missing - before
+        assert 0 < own < box.recorder.status.missing or before == 0
+        assert f" again; {own} steps are missing " in box.said[-1].text
+    box.end()
+
+
+def test_a_power_cut_costs_ten_seconds_at_most_and_the_disk_is_not_asked_each_second(
+    box: Box, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    sync, synced = os.fsync, list[int]()
+
+    def noted(handle: int) -> None:
+        sync(handle)
+        synced.append(box.steps)
+
+    monkeypatch.setattr(os, "fsync", noted)
+    box.record(60)
+    between = [(b - a) / RATE for a, b in pairwise([*synced, box.steps])]
+    assert max(between) < 12.0
+    assert len(synced) < 10
     box.end()
 
 

@@ -5,6 +5,8 @@ from __future__ import annotations
 import io
 import os
 import random
+import struct
+import zlib
 from pathlib import Path
 from typing import Any
 
@@ -70,6 +72,23 @@ def test_every_step_is_read_as_it_was_written(tmp_path: Path) -> None:
         assert step.recorded.events == entry.news.events
     assert [step.number for step in steps if step.begins] == list(range(0, len(TAKEN), SECOND))
     assert recording.head() == head(0, TAKEN[0].now)
+
+
+def test_steps_that_are_too_many_for_one_record_are_in_several(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(recording_file, "MAX_RECORD_BYTES", 10_000)
+    file = io.BytesIO()
+    frames = FrameWriter(file)
+    frames.begin(head(0, TAKEN[0].now))
+    frames.add_steps(0, TAKEN)
+    frames.end()
+    (tmp_path / "a").write_bytes(file.getvalue())
+    recording = Recording([tmp_path / "a"])
+    steps = list(recording.steps())
+    assert [step.number for step in steps] == list(range(len(TAKEN)))
+    assert sum(step.begins for step in steps) > 2
+    assert recording.damage == []
 
 
 # damage
@@ -194,3 +213,22 @@ def test_the_files_of_a_directory_are_ordered_by_their_numbers(tmp_path: Path) -
     (tmp_path / f"000003-x{SUFFIX}").symlink_to(tmp_path / "11")
     found = [path.name.removesuffix(SUFFIX) for path in listed(tmp_path)]
     assert found == [names[1], names[0], names[2]]
+
+
+def framed(*records: bytes) -> bytes:
+    """Return a frame with these records under good checksums."""
+    parts = [struct.pack("<II", len(record), zlib.crc32(record)) + record for record in records]
+    return zstandard.ZstdCompressor().compress(b"".join(parts))
+
+
+def test_a_frame_with_two_heads_or_an_endless_record_costs_itself_alone(tmp_path: Path) -> None:
+    good, encoded = write(TAKEN[:SECOND]), msgspec.msgpack.encode(head(0, TAKEN[0].now))
+    endless = zstandard.ZstdCompressor().compress(struct.pack("<II", 1 << 31, 0) + bytes(100))
+    for bad, why in (
+        (framed(encoded, encoded), "does not have one head"),
+        (framed(encoded) + endless + framed(encoded), "a record has 2147483648 bytes"),
+    ):
+        numbers, recording = read(tmp_path / "a", good + bad + good)
+        assert numbers == 2 * list(range(SECOND))
+        (damage,) = recording.damage
+        assert why in str(damage)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 
 import pytest
@@ -9,8 +10,8 @@ from msgspec.structs import replace
 
 from acsard.core.config.settings import Config
 from acsard.host.errors import RecordingError
-from acsard.recording.file import FrameWriter, Head, Recording
-from acsard.recording.replay import Playback
+from acsard.recording.file import Failure, FrameWriter, Head, Recording
+from acsard.recording.replay import Playback, max_wheel_speed
 from acsard.recording.replay_text import describe_difference
 from tests.unit.drives import CONFIG, drive
 
@@ -52,3 +53,40 @@ def test_a_difference_names_the_side_without_a_pose(tmp_path: Path) -> None:
     assert "pose x 0.000000" in recorded
     assert "no pose" in replayed
     assert "no pose" not in recorded
+
+
+@pytest.mark.parametrize("fastest", range(4))
+def test_the_fastest_wheel_of_a_line_counts(fastest: int) -> None:
+    speeds = [9.0 if wheel == fastest else 1.0 for wheel in range(4)]
+    line = ",".join(f"{letter}n{speed:05.2f}" for letter, speed in zip("abcd", speeds, strict=True))
+    assert max_wheel_speed(f"{line}\r\n".encode()) == 900
+
+
+def test_a_failure_that_cannot_be_tried_again_is_reported_with_the_reason(tmp_path: Path) -> None:
+    last = TAPE.taken[-1]
+    for number, at, words in (
+        (len(TAPE.taken), None, "the recorded daemon failed: KeyError: 'x'"),
+        (len(TAPE.taken) + 5, last.now, "was not replayed, because the step before it is missing"),
+    ):
+        path = TAPE.save(tmp_path / "a")
+        with path.open("ab") as file:
+            frames = FrameWriter(file)
+            start = TAPE.taken[0].now
+            frames.begin(Head("0.2.0", "acsar", len(TAPE.taken), start.mono_ns, start.wall_ns))
+            frames.add(Failure(number, "KeyError: 'x'", at, last.heard if at else None))
+            frames.end()
+        _, playback, _ = played(path)
+        assert words in playback.failed_step()
+
+
+def test_two_paths_are_as_far_apart_as_at_their_farthest(tmp_path: Path) -> None:
+    drive = replace(CONFIG.drive, wheel_radius=2 * CONFIG.drive.wheel_radius)
+    recording = Recording([TAPE.save(tmp_path / "a")])
+    playback, farthest = Playback(recording, replace(CONFIG, drive=drive)), 0.0
+    for step, news in playback.steps():
+        if news.estimates:
+            x, y, _ = (part / 1e6 for part in step.recorded.poses[-1])
+            pose = news.estimates[-1].pose
+            farthest = max(farthest, math.hypot(x - pose.x, y - pose.y))
+    assert playback.comparison.max_distance_m == pytest.approx(farthest, abs=1e-5)
+    assert farthest > 0.5

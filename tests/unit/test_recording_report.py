@@ -11,6 +11,7 @@ import json
 import math
 import re
 import tempfile
+import time
 from collections.abc import Iterable, Iterator, Sequence
 from functools import lru_cache
 from html.parser import HTMLParser
@@ -304,3 +305,24 @@ def test_a_curve_has_a_gap_where_messages_are_missing() -> None:
     for t in (0.0, 0.5, 2.0, 2.5):
         rows.add(t, t)
     assert [math.isnan(value) for _, value in rows.rows()] == [False, False, True, False, False]
+
+
+def test_the_summary_names_the_worst_events_first_and_none_if_there_is_none() -> None:
+    told = [event("a", "link", level="warning"), event("b"), event("c", "fault", level="error")]
+    for events, end in ((told, "s. Events: fault (1), link (1), stop (1)."), ([], "s. ")):
+        text = report([*states()[:1], *events], "acsar", [])
+        assert re.findall(r"<p>(.*?)</p>", text)[0].endswith(end)
+
+
+@pytest.mark.parametrize(("zone", "hours"), [("UTC", 0), ("<+05>-5", 5), ("<-03>3", -3)])
+def test_times_are_those_of_this_computer_s_clock(
+    zone: str, hours: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("TZ", zone)
+    time.tzset()
+    try:
+        at = traces(report([event("a", at_ns=1000 * NS_PER_S)], "acsar", []), "info")[-1]["x"]
+    finally:
+        monkeypatch.undo()
+        time.tzset()
+    assert at == [1000 * (1000 + 3600 * hours)]

@@ -54,6 +54,17 @@ def test_a_source_that_waits_has_an_entry_once_in_a_drive() -> None:
     assert texts(again, "waits") == ["app has priority (by nav)"] * 2
 
 
+def test_each_run_has_its_start_and_one_that_was_cut_off_its_end() -> None:
+    steps = drive().steps()
+    first, second, third = (head(started_ns=run) for run in (1, 2, 3))
+    entries = entries_of(first, *steps, second, third, *steps)
+    runs = [
+        (entry.name, entry.wall_ns) for entry in entries if entry.name in ("start", "cut", "clock")
+    ]
+    begin_ns, end_ns = steps[0].now.wall_ns, steps[-1].now.wall_ns
+    assert runs == [("start", begin_ns), ("cut", end_ns), ("start", begin_ns)]
+
+
 # the messages
 
 

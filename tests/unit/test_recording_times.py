@@ -21,6 +21,7 @@ def at(day: int, hours: int = 0, minutes: int = 0, seconds: float = 0.0) -> int:
     ("text", "begin_ns", "end_ns"),
     [
         ("14:05", at(23, 14, 5), at(23, 14, 5)),
+        ("15:30", at(23, 15, 30), at(23, 15, 30)),  # now, not yesterday
         ("23:59:59.5", at(22, 23, 59, 59.5), at(22, 23, 59, 59.5)),
         ("yesterday 14:05", at(22, 14, 5), at(22, 14, 5)),
         ("today 14:05:30", at(23, 14, 5, 30.0), at(23, 14, 5, 30.0)),
@@ -62,3 +63,9 @@ def test_an_end_follows_its_begin(begin: str, end: str, begin_ns: int, end_ns: i
 def test_a_wrong_time_is_refused_with_examples(text: str) -> None:
     with pytest.raises(TimeError, match=r"write for example 14:05|counts from --from"):
         time_range(text, None, NOW)
+
+
+@pytest.mark.parametrize("end", ["14:05", "+0s", "2026-11-22"])
+def test_an_end_that_is_not_after_its_begin_is_refused(end: str) -> None:
+    with pytest.raises(TimeError, match="not after --from"):
+        time_range("14:05", end, NOW)

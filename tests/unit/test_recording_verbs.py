@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import time
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -12,6 +13,8 @@ from msgspec.structs import replace
 
 from acsard.core.values import Event
 from acsard.host.errors import Exit
+from acsard.host.version import version
+from acsard.recording.file import Head
 from tests.scenarios.taped import Tape
 from tests.scenarios.world import START, World
 from tests.system.typed import typed
@@ -130,3 +133,44 @@ def test_recorded_texts_cannot_send_control_characters_to_the_terminal(tmp_path:
         code, out, _ = log(tmp_path, *words)
         assert (code, "stop" in out) == (0, True)
         assert all(line.isprintable() for line in out.splitlines())
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="needs root, to become a user without permission")
+def test_a_directory_that_this_user_may_not_read_ends_with_77(tmp_path: Path) -> None:
+    os.seteuid(65534)
+    try:
+        code, _, err = log(tmp_path)
+    finally:
+        os.seteuid(0)
+    assert (code, "Permission denied" in err) == (Exit.NO_PERMISSION, True)
+    (tmp_path / "file").touch()
+    code, _, err = log(tmp_path / "file")
+    assert (code, "Not a directory" in err) == (Exit.FAILURE, True)
+
+
+def test_the_file_of_another_program_is_refused_as_what_it_is(where: Path, tmp_path: Path) -> None:
+    other = tmp_path / "drive.csv"
+    code, _, err = log(where, "show", str(other))
+    assert (code, "type the recording's number before it" in err) == (Exit.USAGE, True)
+    other.write_text("t,left,right")
+    code, _, err = log(where, "show", str(other))
+    assert (code, "drive.csv is not a recording of acsard" in err) == (Exit.FAILURE, True)
+
+
+def test_a_replay_names_another_version_that_recorded(where: Path, tmp_path: Path) -> None:
+    path = tmp_path / name(1)
+    code, out, _ = log(where, "replay", "1")
+    assert (code, "recorded this, and acsard" in out) == (0, version() != "0.2.0")
+    for own in (version(), "0.1.9"):
+        tape = Tape()
+        World(recorder=tape).run(1.0)
+        with pytest.MonkeyPatch.context() as patched:
+            patched.setattr("tests.scenarios.taped.Head", partial(versioned, own))
+            tape.save(path)
+        code, out, _ = log(tmp_path, "replay", "1")
+        told = f"acsard {own} recorded this, and acsard {version()} replayed it"
+        assert (code, told in out) == (0, own != version())
+
+
+def versioned(own: str, _: str, *fields: object) -> Head:
+    return Head(own, *fields)  # type: ignore[arg-type]

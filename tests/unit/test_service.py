@@ -9,6 +9,7 @@ import pytest
 
 from acsard.cli import main
 from acsard.host.errors import MendableError
+from acsard.host.version import version
 from acsard.machine import service_installation, versions
 from acsard.machine.deploy_files import source
 from acsard.machine.service_installation import (
@@ -24,6 +25,7 @@ from acsard.machine.service_installation import (
     REMOVE_COMMANDS,
     RULES,
     SETPRIV,
+    TLS_DIRECTORY,
     UNIT,
     UNIT_DIRECTORY,
     File,
@@ -31,8 +33,10 @@ from acsard.machine.service_installation import (
     Remove,
     Run,
     Write,
+    admitting,
     files,
     installing,
+    linking,
     missing_prerequisite,
     uninstalling,
 )
@@ -48,6 +52,30 @@ def test_a_missing_group_or_program_of_the_units_is_reported_with_a_remedy() -> 
     unit = (source() / "systemd" / UNIT).read_text()
     assert f"ExecStopPost=+{SETPRIV} " in unit
     assert f"SupplementaryGroups={GROUP}" in unit
+
+
+@pytest.mark.skipif(
+    os.geteuid() != 0 or versions.HOME.exists(), reason="needs root, and no service"
+)
+@each("words", [("rollback",), ("upgrade", "/nowhere")])
+def test_without_a_service_there_is_nothing_to_upgrade(
+    words: tuple[str, ...], capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["service", *words]) == 1
+    assert "`acsard service install` installs this version" in capsys.readouterr().err
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="needs root, to become another user")
+@each("words", [("install",), ("uninstall",), ("upgrade", "/x"), ("rollback",)])
+def test_only_root_may_change_the_service(
+    words: tuple[str, ...], capsys: pytest.CaptureFixture[str]
+) -> None:
+    os.seteuid(65534)
+    try:
+        assert main(["service", *words]) == 77
+    finally:
+        os.seteuid(0)
+    assert "run this command with sudo" in capsys.readouterr().err
 
 
 @pytest.fixture(name="wanted")
@@ -88,6 +116,57 @@ def test_a_unit_that_was_edited_is_overwritten_only_by_force(wanted: list[File])
     assert installing(wanted, force=True)[1:3] == [Write(unit), Write(own)]
 
 
+@pytest.mark.skipif(os.geteuid() != 0, reason="needs root, to become a user without permission")
+def test_a_file_that_cannot_be_read_is_named_with_the_remedy(tmp_path: Path) -> None:
+    (tmp_path / "unit").touch(0o600)
+    for path, remedy in ((tmp_path / "unit", "with sudo"), (tmp_path, "Is a directory; check")):
+        file = File(path, b"unit")
+        os.seteuid(65534 if path.is_file() else 0)
+        try:
+            assert file.condition() == "unreadable"
+            with pytest.raises(MendableError, match=remedy):
+                installing([file], force=True)
+        finally:
+            os.seteuid(0)
+
+
+@each(("state", "code"), [("active", 0), ("failed", 1)])
+def test_the_status_has_the_versions_and_whether_the_daemon_runs(
+    state: str, code: int, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str],
+    tmp_path: Path,
+) -> None:  # fmt: skip
+    for name in ("0.2.0", "0.3.0"):
+        program = tmp_path / name / "bin" / versions.STOP_PROGRAM
+        program.parent.mkdir(parents=True, exist_ok=True)
+        program.touch()
+    versions.use("0.2.0", tmp_path)
+    for function in (versions.current, versions.unused):
+        monkeypatch.setattr(function, "__defaults__", (tmp_path,))
+    systemctl = tmp_path / "systemctl"
+    systemctl.write_text(f"#!/bin/sh\necho ActiveState={state}\n")
+    systemctl.chmod(0o755)
+    monkeypatch.setenv("PATH", str(tmp_path), prepend=os.pathsep)
+    assert main(["service", "status"]) == code
+    out = capsys.readouterr().out
+    assert out.startswith("version in use: 0.2.0\nversion 0.3.0 is installed, but not in use\n")
+    assert f"{UNIT}:\nActiveState={state}\n" in out
+
+
+@pytest.mark.parametrize("used", ["0.1.9", version()])
+def test_an_installation_beside_another_version_names_the_upgrade_that_can_go_back(
+    used: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    (tmp_path / "current").symlink_to(used)
+    monkeypatch.setattr(versions.current, "__defaults__", (tmp_path,))
+    monkeypatch.setattr(service_installation, "UNIT_DIRECTORY", tmp_path)
+    assert main(["service", "install", "--dry-run"]) == 0
+    text = f"the service runs version {used}; to change to this one, type `acsard service upgrade "
+    assert (text in capsys.readouterr().err) is (used != version())
+
+
 @pytest.fixture(name="machine")
 def _machine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """Return the root of a machine with the installed service, which has been used."""
@@ -120,6 +199,38 @@ def files_in(root: Path) -> set[str]:
     return {str(path.relative_to(root)) for path in root.rglob("*") if not path.is_dir()}
 
 
+@pytest.mark.skipif(os.geteuid() != 0, reason="only root admits computers to the service")
+def test_the_gateway_of_the_service_is_opened_once_and_for_its_own_certificates(
+    machine: Path,
+) -> None:
+    own = Path(TLS_DIRECTORY)
+    assert admitting(own) is None, "this service has no gateway"
+    (machine / "etc/systemd/system" / GATEWAY).touch()
+    assert admitting(Path("/home/me/tls")) is None
+    step = admitting(own)
+    assert step is not None
+    step.do()
+    written = machine / "etc/systemd/system" / f"{GATEWAY}.d" / "lan.conf"
+    assert written.read_bytes() == (source() / "systemd" / "lan.conf").read_bytes()
+    assert admitting(own) is None, "the user may have changed it"
+
+
+def test_a_step_that_removes_a_directory_says_that_all_in_it_goes(machine: Path) -> None:
+    (machine / "link").symlink_to(machine)
+    assert str(Remove(machine)) == f"remove  {machine}/ and everything in it"
+    assert str(Remove(machine / "link")) == f"remove  {machine / 'link'}"
+
+
+def test_acsard_gets_into_the_path_unless_there_is_one(machine: Path) -> None:
+    assert linking() == []
+    command = machine / COMMAND.relative_to("/")
+    command.unlink()
+    command.parent.rmdir()
+    (step,) = linking()
+    step.do()
+    assert command.readlink() == PROGRAM
+
+
 def test_a_removal_says_what_it_leaves_and_a_purge_leaves_nothing(
     machine: Path,
 ) -> None:
@@ -144,7 +255,9 @@ def test_a_removal_says_what_it_leaves_and_a_purge_leaves_nothing(
 
 
 def test_the_files_are_those_of_deploy_with_the_port_of_a_real_robot() -> None:
-    unit, gateway, page, _, configuration = files()
+    unit, gateway, page, rules, configuration = files()
+    assert rules.path == RULES
+    assert rules.content == (source() / "udev" / RULES.name).read_bytes()
     assert (unit.path.name, gateway.path.name, page.path.name) == (UNIT, GATEWAY, PAGE)
     assert b'port = "/dev/acsar"' in configuration.content
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import os
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -35,6 +36,10 @@ def test_a_new_version_in_use_makes_the_one_before_it_the_previous_one(tmp_path:
         versions.use("0.3.0", tmp_path)
         assert (versions.current(tmp_path), versions.previous(tmp_path)) == ("0.3.0", "0.2.0")
     assert (tmp_path / "current" / "bin").is_dir(), "the link is relative"
+    versions.go_back("0.2.0", "0.1.0", tmp_path)
+    assert (versions.current(tmp_path), versions.previous(tmp_path)) == ("0.2.0", "0.1.0")
+    versions.go_back("0.3.0", "", tmp_path)
+    assert (versions.current(tmp_path), versions.previous(tmp_path)) == ("0.3.0", "")
 
 
 def test_the_link_is_never_missing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -121,7 +126,14 @@ def test_a_copy_with_other_content_gets_a_name_of_its_own(
 
     monkeypatch.setattr(versions, "_fill", fill)
     monkeypatch.setattr(versions, "_require_start", lambda place: None)
-    first = versions.copy(tmp_path)
+    before = os.umask(0o077)
+    try:
+        first = versions.copy(tmp_path)
+    finally:
+        os.umask(before)
+    # The service's user must be able to read what root has copied.
+    paths = [tmp_path / first, *(tmp_path / first).rglob("*")]
+    assert {path.stat().st_mode & 0o777 for path in paths} == {0o755, 0o644}
     assert versions.copy(tmp_path) == first
     content = "two"
     second = versions.copy(tmp_path)
@@ -131,6 +143,49 @@ def test_a_copy_with_other_content_gets_a_name_of_its_own(
     assert versions.is_own(first)
     assert versions.is_own(second)
     assert sorted(os.listdir(tmp_path)) == sorted((first, second))
+
+
+def test_a_copy_that_does_not_start_is_refused_and_leaves_no_part(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fill(place: Path, python: str) -> None:
+        (place / "bin").mkdir()
+        (place / "bin" / "acsard").write_text("#!/bin/sh\necho no numpy >&2\nexit 3\n")
+        (place / "bin" / "acsard").chmod(0o755)
+
+    monkeypatch.setattr(versions, "_fill", fill)
+    with pytest.raises(MendableError, match="the copy of acsard does not start: no numpy; correct"):
+        versions.copy(tmp_path)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_one_program_changes_versions_at_a_time_and_clears_what_a_killed_one_left(
+    tmp_path: Path,
+) -> None:
+    home = tmp_path / "opt" / "acsard"
+    for _ in range(2):
+        versions.make_home(home)
+    assert home.stat().st_mode & 0o777 == 0o755
+    (home / ".unfinished-x" / "lib").mkdir(parents=True)
+    with versions.changing(home):
+        assert list(home.iterdir()) == []
+        with (
+            pytest.raises(MendableError, match="another program changes the version in"),
+            versions.changing(home),
+        ):
+            raise AssertionError
+    with versions.changing(home):
+        pass
+
+
+def test_only_versions_that_nothing_needs_are_removed(tmp_path: Path) -> None:
+    versions_in(tmp_path, "0.1.0", "0.2.0", "0.3.0", "0.4.0")
+    for name in ("0.2.0", "0.3.0"):
+        versions.use(name, tmp_path)
+    (tmp_path / versions.PACKAGE / "0.4.0").mkdir(parents=True)
+    versions.remove_others(tmp_path)
+    assert versions.installed(tmp_path) == ["0.2.0", "0.3.0", "0.4.0"]
+    assert not list(tmp_path.glob(".*"))
 
 
 def seen(
@@ -180,12 +235,53 @@ def test_a_version_is_worse_without_the_link_or_with_more_missed_periods(
     assert bool(found) is bool(why)
 
 
+def test_a_version_that_is_installed_is_named_by_its_directory(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    versions_in(tmp_path, "0.3.0")
+    (tmp_path / "0.4.0").mkdir()  # its copy was not finished
+    monkeypatch.setattr(versions, "HOME", tmp_path)
+    monkeypatch.setattr(versions.installed, "__defaults__", (tmp_path,))
+    assert prepare(tmp_path / "0.3.0") == "0.3.0"
+    with pytest.raises(MendableError, match="neither a"):
+        prepare(tmp_path / "0.4.0")
+
+
 def test_only_a_package_or_an_environment_is_a_new_version(tmp_path: Path) -> None:
     with pytest.raises(MendableError, match=r"neither a \.deb nor an environment"):
         prepare(tmp_path)
     (tmp_path / "x.deb").write_text("no package")
     with pytest.raises(MendableError, match="dpkg-deb"):
         prepare(tmp_path / "x.deb")
+
+
+@pytest.mark.skipif(shutil.which("dpkg-deb") is None, reason="needs dpkg-deb")
+def test_the_package_of_another_program_is_refused_before_apt_gets_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    control = tmp_path / "other" / "DEBIAN" / "control"
+    control.parent.mkdir(parents=True)
+    fields = {"Package": "other", "Version": "1", "Architecture": "all", "Description": "x"}
+    fields["Maintainer"] = "x <x@example.org>"
+    control.write_text("".join(f"{name}: {value}\n" for name, value in fields.items()))
+    package = tmp_path / "other.deb"
+    words = ["dpkg-deb", "--root-owner-group", "--build", str(control.parent.parent), str(package)]
+    subprocess.run(words, check=True, stdout=subprocess.DEVNULL)
+    programs = tmp_path / "bin"  # without apt
+    programs.mkdir()
+    for name in ("dpkg-deb", "tar"):
+        (programs / name).symlink_to(shutil.which(name) or "")
+    monkeypatch.setenv("PATH", str(programs))
+    with pytest.raises(MendableError, match=r"other\.deb is the package other; name a package of"):
+        prepare(package)
+
+
+def test_the_last_word_of_an_environment_is_the_version_that_it_copied(tmp_path: Path) -> None:
+    python = tmp_path / "bin" / "python"
+    python.parent.mkdir()
+    python.write_text("#!/bin/sh\necho 1 warning of a library\necho 0.3.0\n")
+    python.chmod(0o755)
+    assert prepare(tmp_path) == "0.3.0"
 
 
 def test_an_environment_whose_program_cannot_copy_itself_is_refused(tmp_path: Path) -> None:

@@ -117,3 +117,14 @@ def test_keep_sets_nothing_if_it_cannot_write_the_file(
     assert main(["set", "rates.telemetry", "5", "--keep"]) == 1
     assert why in capsys.readouterr().err
     assert not robot.settings
+
+
+def test_a_timeout_of_a_source_is_not_kept_and_then_nothing_is_set(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    robot = Robot()
+    monkeypatch.setattr("acsard.cli.robot_options.open_connection", lambda *words, **more: robot)
+    both = ["rates.telemetry", "5", "commands.sources.app.timeout", "0.3"]
+    assert main(["set", *both, "--keep"]) == 2
+    assert "[[commands.sources]] cannot be kept" in capsys.readouterr().err
+    assert not robot.settings
