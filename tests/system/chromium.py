@@ -90,6 +90,10 @@ class Browser:
         """The target id of the current tab."""
         self.said: list[str] = []
         """Console messages and errors of the page."""
+        self._document = ("", "")
+        """The address and the loader of the document that the tab shows."""
+        self._loaded: set[str] = set()
+        """The loaders of the documents whose parts have all arrived."""
 
     def start(self) -> None:
         """Start the browser, and wait until it accepts commands."""
@@ -141,6 +145,7 @@ class Browser:
         self._reader = asyncio.ensure_future(self._read())
         for domain in ("Page", "Runtime", "Log"):
             await self._ask(f"{domain}.enable", {})
+        await self._ask("Page.setLifecycleEventsEnabled", {"enabled": True})
 
     def another(self, **how: bool) -> str:
         """Open a new tab and return its target id.
@@ -165,6 +170,13 @@ class Browser:
                 answer = self._answers.pop(frame["id"], None)
                 if answer is not None and not answer.done():
                     answer.set_result(frame)
+            elif frame["method"] == "Page.frameNavigated":
+                document = frame["params"]["frame"]
+                if "parentId" not in document:
+                    self._document = document["url"], document["loaderId"]
+            elif frame["method"] == "Page.lifecycleEvent":
+                if frame["params"]["name"] == "load":
+                    self._loaded.add(frame["params"]["loaderId"])
             elif frame["method"] == "Runtime.consoleAPICalled":
                 self.said.append(" ".join(str(a.get("value")) for a in frame["params"]["args"]))
             elif frame["method"] == "Runtime.exceptionThrown":
@@ -199,8 +211,20 @@ class Browser:
 
     def open(self, url: str) -> None:
         """Open the address; return when the page is loaded."""
-        self.ask("Page.navigate", url=url)
-        until(lambda: self.js("document.readyState") == "complete", 10.0, url)
+        if loader := self.ask("Page.navigate", url=url).get("loaderId"):
+            until(lambda: loader in self._loaded, 10.0, url)
+
+    def arrives(self, end: str) -> None:
+        """Wait until the tab shows a document whose address ends so, with all its parts.
+
+        While a tab changes its document, `js` may fail.
+        """
+
+        def arrived() -> bool:
+            url, loader = self._document
+            return url.endswith(end) and loader in self._loaded
+
+        until(arrived, 10.0, f"a page {end}")
 
     def js(self, text: str) -> Any:
         """Evaluate a JavaScript expression in the page, wait for a promise, return the value."""
