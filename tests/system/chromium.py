@@ -32,9 +32,6 @@ CHROMIUM = shutil.which(os.environ.get("CHROMIUM", "chromium-headless-shell")) o
 """Debian's headless shell has the same engine without the windows around it. The tests of the page
 take 0.6 times as long in it. `CHROMIUM=chromium` chooses the whole browser."""
 
-HAS_WINDOWS = CHROMIUM is not None and not CHROMIUM.endswith("shell")
-"""Whether a tab can be hidden by another one. The nightly job runs the tests that need it."""
-
 OPTIONS = (
     "--headless", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run",
     "--disable-background-networking", "--disable-component-update", "--disable-sync",
@@ -86,8 +83,6 @@ class Browser:
         self._answers: dict[int, asyncio.Future[Any]] = {}
         self._down: tuple[tuple[float, float], ...] = ()
         self.process: subprocess.Popen[bytes] | None = None
-        self.tab = ""
-        """The target id of the current tab."""
         self.said: list[str] = []
         """Console messages and errors of the page."""
         self._document = ("", "")
@@ -126,42 +121,15 @@ class Browser:
 
     async def _connect(self, port: str) -> None:
         self._session = aiohttp.ClientSession(f"http://127.0.0.1:{port}")
-        await self._attend(next(iter(await self._tabs())))
-
-    async def _tabs(self) -> dict[str, str]:
-        """Return the debugger addresses of the tabs, the front one first."""
         with self._on_host():
             async with self._session.get("/json") as answer:
-                pages = await answer.json()
-        return {
-            page["id"]: page["webSocketDebuggerUrl"] for page in pages if page["type"] == "page"
-        }
-
-    async def _attend(self, tab: str) -> None:
-        url = (await self._tabs())[tab]
-        with self._on_host():
+                targets = await answer.json()
+            url = next(each["webSocketDebuggerUrl"] for each in targets if each["type"] == "page")
             self._socket = await self._session.ws_connect(url, max_msg_size=1 << 26)
-        self.tab = tab
         self._reader = asyncio.ensure_future(self._read())
         for domain in ("Page", "Runtime", "Log"):
             await self._ask(f"{domain}.enable", {})
         await self._ask("Page.setLifecycleEventsEnabled", {"enabled": True})
-
-    def another(self, **how: bool) -> str:
-        """Open a new tab and return its target id.
-
-        The tab opens in front, or with `background` or `newWindow` as these say.
-        """
-        return str(self.ask("Target.createTarget", url="about:blank", **how)["targetId"])
-
-    def attend(self, tab: str) -> None:
-        """Send all later commands to this tab."""
-        self._wait(self._attend(tab))
-        self._down = ()
-
-    def close(self, tab: str) -> None:
-        """Close this tab."""
-        self.ask("Target.closeTarget", targetId=tab)
 
     async def _read(self) -> None:
         async for message in self._socket:
