@@ -6,6 +6,7 @@ import atexit
 import gc
 import inspect
 import os
+import re
 import shutil
 import signal
 import sys
@@ -146,6 +147,15 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log: object) -> _ByUnit:
     return _ByUnit(config, log)
 
 
+def _is_other(nodeid: str) -> bool:
+    """Return whether a usual run tries the other one of this test's two rows of wheels.
+
+    A digest chooses: half of the tests have four wheels and half have two.
+    """
+    two = re.search(r"[\[-]two[\]-]", nodeid) is not None
+    return two == bool(crc32(re.sub(r"\b(four|two)\b", "", nodeid).encode()) & 1)
+
+
 def _all_but_some_are_slow(items: list[pytest.Item]) -> None:
     """Mark most variations of a test as slow, and most of these as nightly.
 
@@ -155,6 +165,8 @@ def _all_but_some_are_slow(items: list[pytest.Item]) -> None:
     for item in items:
         one_in = item.get_closest_marker("variations")
         if one_in is None:
+            if item.get_closest_marker("one_of_both") and _is_other(item.nodeid):
+                item.add_marker(pytest.mark.slow)
             continue
         test = item.nodeid.partition("[")[0]
         counts[test] += 1

@@ -76,8 +76,10 @@ def _recorded(function: Callable[..., Any]) -> Callable[..., Any]:
 def _hear(self: Robot, now: Instant, heard: Heard, hear: Callable[..., News] = Robot.hear) -> News:
     news = hear(self, now, heard)
     SEEN.add(self.status.code)
-    SEEN.update(event.code for event in news.events)
-    SEEN.update(cause.code for cause in self.latches.causes)
+    for event in news.events:
+        SEEN.add(event.code)
+    for cause in self.latches.causes:
+        SEEN.add(cause.code)
     return news
 
 

@@ -83,6 +83,7 @@ class Square:
         return math.dist((pose.x, pose.y), (true.x, true.y)), yaw
 
 
+@pytest.mark.slow
 @pytest.mark.variations(73)
 @pytest.mark.parametrize("stalls", [True, False], ids=["stalls", ""])
 @pytest.mark.parametrize("counts", [16, 20, 96, 400, 1000, 3200])
