@@ -211,6 +211,7 @@ def test_the_noise_of_a_gyro_that_claims_none_is_in_the_covariance(
         assert "used" not in bench.does
 
 
+@pytest.mark.slow
 @pytest.mark.variations(3)
 @pytest.mark.parametrize("who", ["another frame", "first another frame", "the same frame"])
 def test_a_second_gyro_on_the_key_makes_no_wrong_and_certain_heading(who: str) -> None:

@@ -99,6 +99,7 @@ def sound(gyro: ImperfectGyro, second: int) -> None:
     pass
 
 
+@pytest.mark.slow
 @pytest.mark.variations(109)
 @pytest.mark.parametrize("std", ["uncalibrated", 0.0, 0.3])
 @pytest.mark.parametrize("change", [sound, step, back, ramp, half, larger])

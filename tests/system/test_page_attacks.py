@@ -22,8 +22,7 @@ from acsard.web.app import BODY_TIMEOUT_S
 from acsard.web.connections import IDLE_S, UNREAD_S
 from tests.system.browser import NAME, Hands, Page, hands
 from tests.system.bystander import lost
-from tests.system.harness import PATIENCE_S, Bus, Program, resident_kb, until
-from tests.system.strangers import command_line
+from tests.system.harness import PATIENCE_S, Bus, resident_kb, until
 
 pytestmark = pytest.mark.network
 
@@ -214,54 +213,6 @@ async def test_a_flood_of_a_viewer_ends_its_connections_and_delays_no_stop_of_an
             assert theirs.socket.close_code == 1008
         assert target.bus.get("srv/clear")["success"]
     assert {200, 429} <= statuses
-
-
-FLOOD = """\
-import asyncio, aiohttp, os, ssl, sys
-from contextlib import suppress
-os.nice(19)
-url, token, message = sys.argv[1:]
-
-async def flood(session):
-    while True:
-        with suppress(aiohttp.ClientError, ConnectionError):
-            async with session.ws_connect(url + "/ws", ssl=False) as socket:
-                for number in range(2000):
-                    await socket.send_str(message)
-                async for _ in socket:
-                    pass
-
-async def main():
-    headers = {"Authorization": "Bearer " + token}
-    async with aiohttp.ClientSession(headers=headers) as session:
-        floods = [asyncio.create_task(flood(session)) for _ in range(8)]
-        await asyncio.sleep(1.0)
-        print("floods", flush=True)
-        await asyncio.wait(floods)
-
-asyncio.run(main())
-"""
-"""Sends this message without end over eight WebSockets, each of which it opens again and again."""
-
-
-@pytest.mark.nightly
-@pytest.mark.parametrize("message", ['{"call":"stop"}', '{"ping":1}'])
-async def test_floods_on_all_sockets_of_a_viewer_delay_no_stop_of_another(
-    target: Target, message: str
-) -> None:
-    page = target.page
-    with target.refuses("too_fast", 8):
-        async with hands(page, page.invite("operator", f"phone-{time.time_ns()}")) as ours:
-
-            async def stop() -> None:
-                assert (await ours.call("stop"))["ok"]
-
-            words = command_line(FLOOD, page.away, target.tokens["viewer"], message)
-            with Program(words, page.tls) as program:
-                await asyncio.to_thread(program.says, "floods", PATIENCE_S)
-                assert await longest(stop) < 0.5
-        await asyncio.sleep(1.5)  # the last connections end
-        assert target.bus.get("srv/clear")["success"]
 
 
 async def drained(ours: Hands) -> list[str]:
