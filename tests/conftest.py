@@ -6,6 +6,7 @@ import atexit
 import gc
 import inspect
 import os
+import re
 import shutil
 import signal
 import sys
@@ -57,6 +58,8 @@ if sys.dont_write_bytecode or not os.access(__file__, os.W_OK):
     os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 
 
+gc.disable()  # until the tests are collected: nothing of what that makes is garbage
+
 LIVE = ("bench", "firmware", "system", "systemd")
 """Directories whose tests run real processes in real time. They run before the computed tests."""
 
@@ -74,7 +77,7 @@ MARKS = {"slow", "soak", "bench", "network", "systemd", "firmware", "languages",
 
 LOUD = (
     "test_daemon.py", "test_link_faults.py", "test_bus_faults.py", "test_access_isolation.py",
-    "test_page_attacks.py", "test_page_lets_go.py",
+    "test_page_attacks.py", "test_page_outage.py",
     "test_lateness_period.py", "test_recording_disks.py",
     "test_access_strangers.py",
 )  # fmt: skip
@@ -107,17 +110,14 @@ def approved(request: pytest.FixtureRequest) -> Callable[[Path, str], None]:
 def pytest_xdist_auto_num_workers(config: pytest.Config) -> int:
     """Choose the number of test processes.
 
-    Three run the whole suite, because tests of real processes mostly wait. Two run the marked
-    tests: most of these start several daemons, so three processes would use all the time of two
-    cores and tests of real time would fail. Tests that print, and parts of the suite, run in this
-    process only.
+    Two run the whole suite: each takes 3 s to collect the tests, and more would use all the time of
+    two cores, so that tests of real time would fail. Tests that print, and parts of the suite, run
+    in this process only.
     """
     part = config.args_source is not pytest.Config.ArgsSource.TESTPATHS
-    marked, _, left_out = config.option.markexpr.partition("not")
+    left_out = config.option.markexpr.partition("not")[2]
     other = config.option.capture == "no" or "soak" not in left_out
-    if part or other or len(os.sched_getaffinity(0)) < 2:
-        return 0
-    return 2 if marked.strip() else 3
+    return 0 if part or other or len(os.sched_getaffinity(0)) < 2 else 2
 
 
 def _unit(nodeid: str) -> str:
@@ -147,6 +147,15 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log: object) -> _ByUnit:
     return _ByUnit(config, log)
 
 
+def _is_other(nodeid: str) -> bool:
+    """Return whether a usual run tries the other one of this test's two rows of wheels.
+
+    A digest chooses: half of the tests have four wheels and half have two.
+    """
+    two = re.search(r"[\[-]two[\]-]", nodeid) is not None
+    return two == bool(crc32(re.sub(r"\b(four|two)\b", "", nodeid).encode()) & 1)
+
+
 def _all_but_some_are_slow(items: list[pytest.Item]) -> None:
     """Mark most variations of a test as slow, and most of these as nightly.
 
@@ -156,6 +165,8 @@ def _all_but_some_are_slow(items: list[pytest.Item]) -> None:
     for item in items:
         one_in = item.get_closest_marker("variations")
         if one_in is None:
+            if item.get_closest_marker("one_of_both") and _is_other(item.nodeid):
+                item.add_marker(pytest.mark.slow)
             continue
         test = item.nodeid.partition("[")[0]
         counts[test] += 1
@@ -194,6 +205,13 @@ def pytest_pyfunc_call(pyfuncitem: pytest.Function) -> bool | None:
     return True
 
 
+def _loop_s() -> float:
+    began = time.process_time()
+    for _ in range(200_000):
+        pass
+    return 5 * (time.process_time() - began)
+
+
 @pytest.hookimpl(wrapper=True)
 def pytest_runtest_call(item: pytest.Item) -> Generator[None, object, object]:
     """Fail a test without a mark that computes for too long.
@@ -204,13 +222,9 @@ def pytest_runtest_call(item: pytest.Item) -> Generator[None, object, object]:
     result = yield
     took = time.process_time() - began
     usual = settings().max_examples <= 10 and "coverage" not in sys.modules
-    if took > 0.5 and usual and not MARKS & {mark.name for mark in item.iter_markers()}:
-        began = time.process_time()
-        for _ in range(1_000_000):
-            pass
-        loops = took / (time.process_time() - began)
-        if loops > LONGEST:
-            pytest.fail(f"{took:.1f} s of processor time: make it smaller, or mark it `slow`")
+    marked = MARKS & {mark.name for mark in item.iter_markers()}
+    if took > 0.5 and usual and not marked and took / _loop_s() > LONGEST:
+        pytest.fail(f"{took:.1f} s of processor time: make it smaller, or mark it `slow`")
     return result
 
 
@@ -220,5 +234,5 @@ def pytest_collection_finish() -> None:
     Scanning thousands of tests took a quarter of a second, and it could happen in the middle of a
     test that measures time.
     """
-    gc.collect()
     gc.freeze()
+    gc.enable()

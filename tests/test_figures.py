@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import re
-import subprocess
 import sys
 
 import pytest
 
-from tests.pages import ROOT
-from tests.tools.figures import PAGE, SECTIONS, with_section
+from tests.tools.figures import PAGE, SECTIONS, main, with_section
 
 TEXT = PAGE.read_text(encoding="utf-8")
 MEASURED = (
@@ -40,8 +38,16 @@ def test_a_new_measurement_replaces_its_section_only() -> None:
     [(["speed"], "no section speed: choose from daemon"),
      (["packages", "--dist", "nowhere", "--print"], "packages is not measured: name the files")],
 )  # fmt: skip
-def test_what_cannot_be_measured_is_said(words: list[str], said: str) -> None:
-    command = [sys.executable, "-m", "tests.tools.figures", *words]
-    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
-    assert done.returncode != 0
-    assert said in done.stderr
+def test_what_cannot_be_measured_is_said(
+    words: list[str],
+    said: str,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.setattr(sys, "argv", ["figures", *words])
+    try:
+        code: object = main()
+    except SystemExit as end:
+        code = end.code
+    assert code
+    assert said in capsys.readouterr().err

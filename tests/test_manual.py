@@ -129,6 +129,7 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
         return {name: files.read(name).decode() for name in names}
 
 
+@pytest.mark.slow
 def test_the_manual_builds_strictly_and_loads_nothing_from_other_servers(
     site: dict[str, str],
 ) -> None:
@@ -143,6 +144,7 @@ def test_the_manual_builds_strictly_and_loads_nothing_from_other_servers(
         assert not unrendered, f"{name}: a list or table needs an empty line before it"
 
 
+@pytest.mark.slow
 def test_the_manual_contains_the_files_of_its_version(site: dict[str, str]) -> None:
     assert 'href="../files/deploy/firmware/acsar/acsar.ino"' in site["howto/flash.html"]
     carried = {name.removeprefix("files/") for name in site if name.startswith("files/")}

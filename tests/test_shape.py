@@ -84,12 +84,6 @@ def imported(module: str) -> Iterator[str]:
 # imports
 
 
-def test_the_import_contracts_are_kept() -> None:
-    command = [str(Path(sys.executable).parent / "lint-imports"), "--no-cache"]
-    done = subprocess.run(command, capture_output=True, text=True, check=False, cwd=ROOT)
-    assert done.returncode == 0, done.stdout + done.stderr
-
-
 def test_a_module_of_the_core_neither_opens_nor_prints() -> None:
     calls = {
         (module, node.func.id)

@@ -44,6 +44,7 @@ def test_the_release_script_writes_the_man_page_and_the_completions(tmp_path: Pa
             subprocess.run([shell, "-n", str(tmp_path / name)], check=True, timeout=30.0)
 
 
+@pytest.mark.slow
 @each("shell", BEFORE)
 def test_a_shell_completes_a_service_and_a_subcommand(shell: str, tmp_path: Path) -> None:
     if shutil.which(shell) is None:

@@ -1,8 +1,7 @@
 """The far end of the serial wire in a benchmark: a process that simulates the board on a pty.
 
 The process has real-time priority if it has permission. At its start, it writes the path of the pty
-to standard output. When its standard input ends, it writes all recorded data to standard output and
-ends.
+to standard output. When its standard input ends, it writes all recorded data to a file and ends.
 """
 
 from __future__ import annotations
@@ -88,8 +87,8 @@ class FarEnd:
             self._timer.set(due_ns)
 
 
-def main(config: Config) -> None:
-    """Simulate the board until standard input ends, then write a `RecordedTraffic` to stdout."""
+def main(config: Config, record: Path) -> None:
+    """Simulate the board until standard input ends, then write a `RecordedTraffic` to a file."""
     try:
         # Other processes must not delay the simulated board: a real one has its own processor.
         os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(80))
@@ -102,13 +101,8 @@ def main(config: Config) -> None:
     sys.stdout.flush()
     gc.disable()
     end.play(sys.stdin.fileno())
-    try:
-        sys.stdout.buffer.write(msgspec.msgpack.encode(end.seen))
-        sys.stdout.flush()
-    except BrokenPipeError:
-        # The benchmark has been killed.
-        os._exit(1)
+    record.write_bytes(msgspec.msgpack.encode(end.seen))
 
 
 if __name__ == "__main__":
-    main(from_builtins(msgspec.json.decode(Path(sys.argv[1]).read_bytes())))
+    main(from_builtins(msgspec.json.decode(Path(sys.argv[1]).read_bytes())), Path(sys.argv[2]))

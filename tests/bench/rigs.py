@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import socket
 import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -26,6 +25,7 @@ from acsard.core.config.settings import (
 from acsard.core.config.toml_text import document
 from tests.bench.matching import Record, command_waits, feedback_delays, staircase
 from tests.bench.rig import ACSARD, Rig
+from tests.system.harness import free_endpoint
 
 POLLED = (sys.executable, "-m", "tests.bench.polled")
 """The original driver's method."""
@@ -67,13 +67,6 @@ def config() -> Config:
             angular_stop_deceleration=500.0,
         ),
     )
-
-
-def free_endpoint() -> str:
-    """Return an endpoint on the loopback interface on which no process listens."""
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
 
 
 def sibling(settings: Config, number: int) -> Config:

@@ -17,6 +17,8 @@ from hypothesis import strategies as st
 from tests.each import each
 from tests.firmware.board import Library
 
+pytestmark = pytest.mark.slow
+
 TOP = 400
 """PWM_TOP at 16 MHz and 20 kHz."""
 

@@ -23,6 +23,8 @@ from tests.each import each
 from tests.firmware.board import Library, checked, read_identity, read_reply, speeds_line
 from tests.vectors.lines import ACCEPTED, REFUSED, SEED_LINE, ZERO
 
+pytestmark = pytest.mark.slow
+
 
 class Command(NamedTuple):
     """The decoded fields of a line to the board."""

@@ -104,7 +104,12 @@ class Sketch:
                 self.c.host_level(pin, level)
 
 
-@pytest.fixture(params=CORES)
+@pytest.fixture(
+    params=[
+        pytest.param(core, marks=pytest.mark.slow if number else ())
+        for number, core in enumerate(CORES)
+    ]
+)
 def sketch(request: pytest.FixtureRequest, tmp_path: Path) -> Sketch:
     if shutil.which("g++") is None:
         pytest.skip("no g++")

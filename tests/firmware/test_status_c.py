@@ -12,6 +12,8 @@ from acsard.core.link.board_status import BoardStatus, decode_status
 from tests.firmware.board import Library
 from tests.firmware.conftest import ALL_INPUTS
 
+pytestmark = pytest.mark.slow
+
 CLOSED = 0b100000
 """Levels of the pins when nothing is pressed: contacts to ground, and no fault."""
 

@@ -262,7 +262,7 @@ def test_an_echo_beside_a_board_is_never_driven(period: float, latency_ms: int) 
 # Motors that follow exactly are no board without encoders
 
 
-@pytest.mark.variations(3)
+@pytest.mark.variations(10)
 @pytest.mark.parametrize(
     # 0.2 m/s2 are 4 rad/s2: the ramps are steeper than `STEEP`.
     ("lag_s", "acceleration"),

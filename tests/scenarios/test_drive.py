@@ -240,6 +240,7 @@ def test_checked_replies_give_the_round_trip_time_of_the_microcontroller() -> No
     assert 6_700 <= round_trip.p50 <= 12_000
 
 
+@pytest.mark.slow
 def test_the_course_robot_drives_and_turns_with_all_its_faults() -> None:
     """At each reversal its board gives a whole report the sign of its last edge."""
     faults = "free_running", "comma_latched", "no_watchdog", "last_edge", "toggled_direction"

@@ -47,6 +47,7 @@ def lose(world: World, seconds: float, *, unplug: bool) -> None:
             world.run(seconds)
 
 
+@pytest.mark.variations(13)
 @pytest.mark.parametrize("unplug", [False, True])
 @pytest.mark.parametrize("counts", [20, 400])
 @pytest.mark.parametrize("lines_s", [0.05, 0.1, 0.3])
@@ -96,6 +97,7 @@ def slower_than_declared(wheels: WheelMap, period: float, each: float) -> World:
     return world
 
 
+@pytest.mark.variations(5)
 @pytest.mark.parametrize("to_and_fro", [False, True])
 @pytest.mark.parametrize(("period", "each"), [(0.02, 0.1), (0.1, 0.2), (0.2, 0.4)])
 @four_and_two
@@ -117,10 +119,8 @@ def test_lines_of_which_each_ends_a_silence_show_a_runaway(
     assert faults(world)[0] == "wheel_runaway"
 
 
-@pytest.mark.parametrize(
-    "seed",
-    [*range(12), *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(12, 60))],
-)
+@pytest.mark.variations(61)
+@pytest.mark.parametrize("seed", range(60))
 @four_and_two
 def test_a_sound_robot_behind_silences_latches_no_fault(seed: int, wheels: WheelMap) -> None:
     """The board is silent, the computer stalls, both, or the port is lost."""

@@ -107,7 +107,6 @@ def test_a_gyro_that_is_40_ms_late_has_a_small_heading_error_too() -> None:
     assert drive.world.state.gyro == "used"
 
 
-@pytest.mark.slow
 def test_a_gyro_that_dies_is_reported_and_the_wheels_go_on() -> None:
     made = world()
     made.drive(0.3, 0.5, 1.0)

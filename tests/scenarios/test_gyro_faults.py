@@ -167,6 +167,7 @@ MORE = (pytest.mark.slow, pytest.mark.nightly)
 FIRST = ("hangs in a turn",)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("fault", "period"),
     [
@@ -187,7 +188,7 @@ def test_the_heading_of_a_faulty_gyro_stays_within_its_covariance(fault: str, pe
 @pytest.mark.parametrize(
     ("still", "noise", "period", "seed"),
     [
-        (0.1, 0.1, 5, 2),
+        pytest.param(0.1, 0.1, 5, 2, marks=pytest.mark.slow),
         pytest.param(0.004, 0.3, 10, 2, marks=MORE),
         *(
             pytest.param(still, 0.3, period, seed, marks=MORE)
@@ -210,6 +211,7 @@ def test_the_noise_of_a_gyro_that_claims_none_is_in_the_covariance(
         assert "used" not in bench.does
 
 
+@pytest.mark.slow
 @pytest.mark.variations(3)
 @pytest.mark.parametrize("who", ["another frame", "first another frame", "the same frame"])
 def test_a_second_gyro_on_the_key_makes_no_wrong_and_certain_heading(who: str) -> None:

@@ -111,6 +111,7 @@ def test_without_an_echo_a_constant_queue_from_the_first_command_on_cannot_be_se
     assert obeyed > 150
 
 
+@pytest.mark.slow
 @each("way", STAMPED)
 def test_a_sender_drives_on_as_soon_as_it_is_prompt_again(way: Way) -> None:
     world = quiet()

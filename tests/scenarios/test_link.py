@@ -189,6 +189,7 @@ def test_a_slow_wire_drives_at_the_rate_it_carries() -> None:
     assert world.state.counters.get("lines_superseded", 0) == 0
 
 
+@pytest.mark.slow
 @pytest.mark.variations(3)
 @pytest.mark.parametrize("stall", [0.105, 0.15, 0.22])
 def test_a_stall_of_this_computer_does_not_stop_the_robot_without_a_ramp(stall: float) -> None:

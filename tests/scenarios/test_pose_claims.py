@@ -99,7 +99,8 @@ def sound(gyro: ImperfectGyro, second: int) -> None:
     pass
 
 
-@pytest.mark.variations(9)
+@pytest.mark.slow
+@pytest.mark.variations(109)
 @pytest.mark.parametrize("std", ["uncalibrated", 0.0, 0.3])
 @pytest.mark.parametrize("change", [sound, step, back, ramp, half, larger])
 @pytest.mark.parametrize("plan", [turns, left, straight])
@@ -125,7 +126,8 @@ def test_a_gyro_that_contradicts_the_wheels_is_a_doubt_and_is_said(
         assert "gyro_disagrees" in doubts
 
 
-@pytest.mark.variations(6)
+@pytest.mark.slow
+@pytest.mark.variations(21)
 @pytest.mark.parametrize("share", [0.9, 0.97, 1.03, 1.07, 1.1])
 @pytest.mark.parametrize("std", ["uncalibrated", 0.02])
 @four_and_two
@@ -143,6 +145,7 @@ def test_a_share_of_a_turn_by_which_gyro_and_wheels_may_differ_is_claimed(
         assert heading_sigmas(world) < 2.0
 
 
+@pytest.mark.variations(7)
 @pytest.mark.parametrize("counts", [16, 20, 48, 96, 360])
 @pytest.mark.parametrize("period", [0.01, 0.02, 0.1])
 @four_and_two

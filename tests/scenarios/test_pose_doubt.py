@@ -61,7 +61,8 @@ def test_counts_that_contradict_the_speeds_are_a_doubt_and_a_warning_has_both_va
     assert sigmas(robot) < 2.0
 
 
-@pytest.mark.variations(4)
+@pytest.mark.slow
+@pytest.mark.variations(49)
 @pytest.mark.parametrize("forward", [1.0, 3.0, 4.0, 6.0])
 @pytest.mark.parametrize("back", [3.0, 4.0])
 @pytest.mark.parametrize("wrong", [0.7, 0.5, 1.6])
@@ -80,7 +81,7 @@ def test_wrong_counts_of_a_robot_that_goes_to_and_fro_are_not_forgotten(
         assert robot.state.mode == "driving", robot.state.reason
 
 
-@pytest.mark.variations(4)
+@pytest.mark.variations(21)
 @pytest.mark.parametrize("turn", [0.0, 0.6])
 @pytest.mark.parametrize("seconds", [1.0, 1.5, 2.0, 2.5, 3.0])
 @pytest.mark.parametrize("wrong", [0.5, 1.6])
@@ -96,7 +97,8 @@ def test_wrong_counts_of_a_robot_that_goes_to_and_fro_at_once_are_no_fault_of_a_
             assert robot.state.mode == "driving", robot.state.reason
 
 
-@pytest.mark.variations(6)
+@pytest.mark.slow
+@pytest.mark.variations(55)
 @pytest.mark.parametrize("counts", [16, 96, 3200])
 @pytest.mark.parametrize("lag", [0.0, 0.05, 0.2])
 @pytest.mark.parametrize("speed", [0.05, 0.3, 0.8])
@@ -206,6 +208,7 @@ def test_a_coarse_encoder_behind_an_adapter_of_16_ms_advises_the_checked_link(co
     assert robot.state.pose_doubt == "coarse_encoder"
 
 
+@pytest.mark.variations(9)
 @pytest.mark.parametrize(("link_check", "wheels"), [("off", FOUR), ("on", FOUR), ("off", TWO)])
 @pytest.mark.parametrize(
     ("counts", "code"), [(16, "encoder_counts_missing"), (96, "encoder_counts_missing"), (400, "")]
@@ -232,7 +235,7 @@ def nothing(robot: World) -> None:
     pass
 
 
-@pytest.mark.variations(3)
+@pytest.mark.variations(5)
 @pytest.mark.parametrize(
     ("counts", "link_check", "fault"),
     [

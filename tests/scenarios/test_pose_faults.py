@@ -28,7 +28,7 @@ def check(case: Case) -> None:
     assert result.unsaid < 6.0, result
 
 
-@pytest.mark.variations(4)
+@pytest.mark.variations(9)
 @pytest.mark.parametrize("case", SOME, ids=lambda case: case.name)
 def test_a_wheel_fault_never_makes_a_wrong_pose_certain(case: Case) -> None:
     check(case)

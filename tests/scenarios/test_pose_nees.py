@@ -21,7 +21,8 @@ def check(name: str, wheels: WheelMap, first: int, robots: int) -> None:
     assert mean < 6.0
 
 
-@pytest.mark.variations(8)
+@pytest.mark.slow
+@pytest.mark.variations(60)
 @pytest.mark.parametrize("name", ROWS)
 @four_and_two
 def test_a_pose_is_as_uncertain_as_it_is_wrong(name: str, wheels: WheelMap) -> None:

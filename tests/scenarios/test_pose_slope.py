@@ -69,7 +69,8 @@ def driven(
         yield world
 
 
-@pytest.mark.variations(6)
+@pytest.mark.slow
+@pytest.mark.variations(12)
 @pytest.mark.parametrize("lag", [0.05, 0.2])
 @pytest.mark.parametrize("plan", [arcs, in_all_directions, uphill])
 @four_and_two
@@ -85,6 +86,8 @@ def test_on_a_slope_the_pose_is_as_uncertain_as_its_share_of_the_way(
     assert world.state.mode == "driving"
 
 
+@pytest.mark.slow
+@pytest.mark.variations(6)
 @pytest.mark.parametrize("plan", [arcs, in_all_directions, uphill])
 @pytest.mark.parametrize("lag", [0.02, 0.3])
 def test_motors_that_are_later_or_earlier_than_expected_leave_little_in_doubt(

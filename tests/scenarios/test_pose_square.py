@@ -13,6 +13,7 @@ import random
 import pytest
 
 from acsard.core.config.settings import Config, McuConfig, SimConfig, WheelMap
+from acsard.core.simulator.vehicle import whole_counts
 from acsard.core.values import Pose
 from tests.scenarios.world import World
 from tests.stepped import Outputs
@@ -63,7 +64,7 @@ class Square:
     def _count(self, outputs: Outputs) -> None:
         """Advance the pose of the raw counts to the present."""
         angles = self.world.mcu.vehicle.angles
-        counts = [math.floor(angle / math.tau * self._counts + 0.5) for angle in angles]
+        counts = [whole_counts(angle, self._counts) for angle in angles]
         a, b, c, d = (now - then for now, then in zip(counts, self._before, strict=True))
         self._before = counts
         metres = math.tau / self._counts * 0.05
@@ -82,7 +83,8 @@ class Square:
         return math.dist((pose.x, pose.y), (true.x, true.y)), yaw
 
 
-@pytest.mark.variations(36)
+@pytest.mark.slow
+@pytest.mark.variations(73)
 @pytest.mark.parametrize("stalls", [True, False], ids=["stalls", ""])
 @pytest.mark.parametrize("counts", [16, 20, 96, 400, 1000, 3200])
 @pytest.mark.parametrize("link", ["plain", "checked", "checked with counts"])

@@ -192,7 +192,7 @@ def test_errors_of_many_equal_silences_add_up_within_the_covariance(
     assert abs(error) < 2.0 * math.sqrt(variance), f"{error:+.3f} m"
 
 
-@pytest.mark.variations(5)
+@pytest.mark.variations(13)
 @pytest.mark.parametrize("wheel", [0, 1])
 @pytest.mark.parametrize("tens", [b"0", b"3", b"5"])
 @pytest.mark.parametrize(("rate", "silence_s"), [(10.0, 0.0), (100.0, 0.15), (100.0, 0.5)])

@@ -29,6 +29,7 @@ def sigmas(world: World) -> float:
     return max(abs(e) / math.sqrt(cells[k]) for e, k in zip(off, (0, 7, 35), strict=True))
 
 
+@pytest.mark.variations(13)
 @pytest.mark.parametrize("stall", [0.2, 0.4, 0.6])
 @pytest.mark.parametrize(("linear", "angular"), [(0.5, 0.0), (0.0, 1.2)])
 @pytest.mark.parametrize("link_check", ["off", "on"])
@@ -48,7 +49,7 @@ def test_a_stall_of_this_computer_is_a_doubt_if_the_board_reports_its_last_insta
     assert sigmas(world) < 3.0
 
 
-@pytest.mark.variations(10)
+@pytest.mark.variations(65)
 @pytest.mark.parametrize("together", [True, False], ids=["one read", "paced"])
 @pytest.mark.parametrize("repeats", [True, False], ids=["repeats", "zeros"])
 @pytest.mark.parametrize("baud", [115_200, 500_000])
@@ -109,6 +110,7 @@ def test_a_robot_that_is_pushed_while_its_board_is_away_is_not_certain(
     assert world.odom.pose.covariance[0] < 1e-3
 
 
+@pytest.mark.variations(19)
 @pytest.mark.parametrize("counts", [16, 20, 48, 96])
 @pytest.mark.parametrize("speed", [0.15, 0.3, 0.45])
 @pytest.mark.parametrize("period", [0.07, 0.1, 0.2])
@@ -128,6 +130,7 @@ def test_a_board_that_reports_rarely_gives_the_mean_of_its_wheels(
     assert world.state.mode != "fault"
 
 
+@pytest.mark.variations(12)
 @pytest.mark.parametrize("link_check", ["off", "on"])
 @pytest.mark.parametrize("gyro", [False, True])
 @pytest.mark.parametrize(("load", "push"), [(0.2, None), (1.0, None), (0.0, 0.5)])

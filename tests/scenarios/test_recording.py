@@ -56,6 +56,7 @@ def test_a_replay_counts_lines_and_commands_as_the_daemon_did() -> None:
     assert replayed(tape, PLAIN).robot.state.counters == counters
 
 
+@pytest.mark.slow
 def test_a_drive_of_two_wheels_replays_to_the_bit_from_its_start_and_its_states() -> None:
     config = replace(PLAIN, mcu=McuConfig(wheels=TWO))
     tape, world = recorded_world(config, every=5 * BATCH)

@@ -471,6 +471,7 @@ RECORDED = {
 }
 
 
+@pytest.mark.variations(5)
 @pytest.mark.parametrize("road", ["rmw", "bridge"])
 @pytest.mark.parametrize("name", RECORDED)
 def test_a_goal_under_way_drives_on_after_a_second_of_rest_and_not_before(

@@ -187,6 +187,7 @@ def test_a_clear_read_before_a_later_stop_and_delivered_after_it_leaves_that_sto
     assert world.state.mode == "ready"
 
 
+@pytest.mark.variations(4)
 @pytest.mark.parametrize("stall_s", [0.05, 0.16, 0.5, 1.0])
 def test_a_plain_clear_works_on_a_computer_that_stalls_all_the_time(
     world: World, stall_s: float

@@ -99,6 +99,7 @@ def test_a_faulty_encoder_stops_the_robot_and_is_named(
     assert world.state.mode == "driving"
 
 
+@pytest.mark.variations(5)
 @pytest.mark.parametrize(("counts", "period", "limit"), [(20, 0.02, 22.0), (16, 0.01, 25.0)])
 @pytest.mark.parametrize("rolls_on", [False, True])
 def test_a_limit_below_one_count_of_an_encoder_hides_neither_the_way_nor_a_runaway(
@@ -119,6 +120,7 @@ def test_a_limit_below_one_count_of_an_encoder_hides_neither_the_way_nor_a_runaw
             assert world.state.code == "wheel_runaway"
 
 
+@pytest.mark.variations(5)
 @pytest.mark.parametrize(("configured", "real"), [(0, 20), (20, 20), (0, 3200)])
 @pytest.mark.parametrize("drives", [False, True])
 @pytest.mark.parametrize(("speed", "wheels"), [(95.0, FOUR), (99.99, FOUR), (95.0, TWO)])
@@ -137,6 +139,7 @@ def test_lasting_impossible_speeds_are_a_fault_although_one_count_is_excused(
     assert abs(world.state.x - began) < 0.3
 
 
+@pytest.mark.variations(5)
 @pytest.mark.parametrize(("speed", "wheels"), [(95.0, FOUR), (99.99, FOUR), (95.0, TWO)])
 @pytest.mark.parametrize("drives", [False, True])
 @pytest.mark.parametrize("every", [20, 50])
@@ -151,6 +154,7 @@ def test_impossible_lines_do_not_teach_that_the_encoders_are_coarse(
     assert abs(world.state.yaw) < 0.05
 
 
+@pytest.mark.variations(7)
 @four_and_two
 @pytest.mark.parametrize("speeds_up", [False, True])
 def test_wheels_with_few_counts_are_a_fault_only_if_they_are_too_fast(
@@ -270,6 +274,7 @@ def test_two_swapped_motors_are_one_cause_whichever_wheel_shows_it(wheels: Wheel
     assert [cause.code for cause in world.state.causes].count("wheels_swapped") == 1
 
 
+@pytest.mark.variations(5)
 @four_and_two
 @pytest.mark.parametrize("counts", [48, 400, 3200])
 def test_encoders_that_die_all_at_once_stop_the_robot_within_a_second_by_one_fault(
@@ -341,6 +346,7 @@ def test_a_way_that_dead_encoders_do_not_show_is_in_the_covariance(wheels: Wheel
     assert true.x < 2.3 * math.sqrt(world.odom.pose.covariance[0])
 
 
+@pytest.mark.variations(5)
 @four_and_two
 @pytest.mark.parametrize("fault", ["reversed_encoder", "frozen_encoder"])
 def test_what_a_wheel_with_a_latched_fault_falsified_is_in_the_covariance(

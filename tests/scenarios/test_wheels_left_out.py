@@ -103,7 +103,6 @@ def test_with_one_wheel_fault_the_pose_stays_right_and_state_names_the_wheel(
     assert any(f"{WHEELS[wheel]} wheel is left out" in report for report in reports)
 
 
-@SLOW
 def test_with_a_gyro_and_a_wheel_fault_heading_and_distance_stay_right() -> None:
     made = world(ImperfectGyro(bias=0.01), SimConfig(track_multiplier=1.6))
     made.drive(0.4, 0.8, seconds=3.0)
@@ -120,7 +119,6 @@ def test_with_a_gyro_and_a_wheel_fault_heading_and_distance_stay_right() -> None
     assert turn < 0.1
 
 
-@pytest.mark.slow
 @pytest.mark.variations(3)
 @pytest.mark.parametrize(
     ("lag", "reaches"), [(0.6, 0.6), pytest.param(0.6, 1.0, marks=SLOW), pytest.param(0.2, 0.6)]

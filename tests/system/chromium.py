@@ -32,9 +32,6 @@ CHROMIUM = shutil.which(os.environ.get("CHROMIUM", "chromium-headless-shell")) o
 """Debian's headless shell has the same engine without the windows around it. The tests of the page
 take 0.6 times as long in it. `CHROMIUM=chromium` chooses the whole browser."""
 
-HAS_WINDOWS = CHROMIUM is not None and not CHROMIUM.endswith("shell")
-"""Whether a tab can be hidden by another one. The nightly job runs the tests that need it."""
-
 OPTIONS = (
     "--headless", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run",
     "--disable-background-networking", "--disable-component-update", "--disable-sync",
@@ -86,10 +83,12 @@ class Browser:
         self._answers: dict[int, asyncio.Future[Any]] = {}
         self._down: tuple[tuple[float, float], ...] = ()
         self.process: subprocess.Popen[bytes] | None = None
-        self.tab = ""
-        """The target id of the current tab."""
         self.said: list[str] = []
         """Console messages and errors of the page."""
+        self._document = ("", "")
+        """The address and the loader of the document that the tab shows."""
+        self._loaded: set[str] = set()
+        """The loaders of the documents whose parts have all arrived."""
 
     def start(self) -> None:
         """Start the browser, and wait until it accepts commands."""
@@ -122,41 +121,15 @@ class Browser:
 
     async def _connect(self, port: str) -> None:
         self._session = aiohttp.ClientSession(f"http://127.0.0.1:{port}")
-        await self._attend(next(iter(await self._tabs())))
-
-    async def _tabs(self) -> dict[str, str]:
-        """Return the debugger addresses of the tabs, the front one first."""
         with self._on_host():
             async with self._session.get("/json") as answer:
-                pages = await answer.json()
-        return {
-            page["id"]: page["webSocketDebuggerUrl"] for page in pages if page["type"] == "page"
-        }
-
-    async def _attend(self, tab: str) -> None:
-        url = (await self._tabs())[tab]
-        with self._on_host():
+                targets = await answer.json()
+            url = next(each["webSocketDebuggerUrl"] for each in targets if each["type"] == "page")
             self._socket = await self._session.ws_connect(url, max_msg_size=1 << 26)
-        self.tab = tab
         self._reader = asyncio.ensure_future(self._read())
         for domain in ("Page", "Runtime", "Log"):
             await self._ask(f"{domain}.enable", {})
-
-    def another(self, **how: bool) -> str:
-        """Open a new tab and return its target id.
-
-        The tab opens in front, or with `background` or `newWindow` as these say.
-        """
-        return str(self.ask("Target.createTarget", url="about:blank", **how)["targetId"])
-
-    def attend(self, tab: str) -> None:
-        """Send all later commands to this tab."""
-        self._wait(self._attend(tab))
-        self._down = ()
-
-    def close(self, tab: str) -> None:
-        """Close this tab."""
-        self.ask("Target.closeTarget", targetId=tab)
+        await self._ask("Page.setLifecycleEventsEnabled", {"enabled": True})
 
     async def _read(self) -> None:
         async for message in self._socket:
@@ -165,6 +138,13 @@ class Browser:
                 answer = self._answers.pop(frame["id"], None)
                 if answer is not None and not answer.done():
                     answer.set_result(frame)
+            elif frame["method"] == "Page.frameNavigated":
+                document = frame["params"]["frame"]
+                if "parentId" not in document:
+                    self._document = document["url"], document["loaderId"]
+            elif frame["method"] == "Page.lifecycleEvent":
+                if frame["params"]["name"] == "load":
+                    self._loaded.add(frame["params"]["loaderId"])
             elif frame["method"] == "Runtime.consoleAPICalled":
                 self.said.append(" ".join(str(a.get("value")) for a in frame["params"]["args"]))
             elif frame["method"] == "Runtime.exceptionThrown":
@@ -199,8 +179,20 @@ class Browser:
 
     def open(self, url: str) -> None:
         """Open the address; return when the page is loaded."""
-        self.ask("Page.navigate", url=url)
-        until(lambda: self.js("document.readyState") == "complete", 10.0, url)
+        if loader := self.ask("Page.navigate", url=url).get("loaderId"):
+            until(lambda: loader in self._loaded, 10.0, url)
+
+    def arrives(self, end: str) -> None:
+        """Wait until the tab shows a document whose address ends so, with all its parts.
+
+        While a tab changes its document, `js` may fail.
+        """
+
+        def arrived() -> bool:
+            url, loader = self._document
+            return url.endswith(end) and loader in self._loaded
+
+        until(arrived, 10.0, f"a page {end}")
 
     def js(self, text: str) -> Any:
         """Evaluate a JavaScript expression in the page, wait for a promise, return the value."""

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import json
 import secrets
-import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, ExitStack, contextmanager
@@ -95,7 +94,6 @@ class Door:
 
     def __init__(self, stage: Stage) -> None:
         self.robot, self.bus = stage, stage.bus
-        self._silent = threading.Event()
 
     def __enter__(self) -> Door:
         self.stack = ExitStack()
@@ -141,12 +139,15 @@ class Door:
             self.send(*(self.speeds if self.waits() != "neutral" else (0.0, 0.0)))
 
         self.arm()
-        with repeated(send) as self._silent:
+        with repeated(send) as self._silence:
             yield
 
     def silence(self) -> None:
-        """Let the program behind `drive` send nothing more, as if it hung."""
-        self._silent.set()
+        """Let the program behind `drive` send nothing more, as if it hung.
+
+        When this function returns, the program has sent its last command.
+        """
+        self._silence()
 
     def stop(self) -> None:
         raise NotImplementedError

@@ -94,7 +94,7 @@ class Sync(OfClient):
     def drive(self) -> Iterator[None]:
         with (
             connect(self.robot.endpoint) as robot,
-            repeated(lambda: robot.send(*self.speeds)) as self._silent,
+            repeated(lambda: robot.send(*self.speeds)) as self._silence,
         ):
             yield
 
@@ -145,14 +145,23 @@ class Async(OfClient):
     def drive(self) -> Iterator[None]:
         driving = self._client.drive(*self.speeds, seconds=60.0)
         task = asyncio.run_coroutine_threadsafe(driving, self._loop)
+        self._resumes = threading.Event()
         try:
             yield
         finally:
+            self._resumes.set()
             task.cancel()
             self.run(asyncio.sleep(0.2))  # in which it sends its zeros
 
     def silence(self) -> None:
-        self._loop.call_soon_threadsafe(time.sleep, 1.0)
+        hangs = threading.Event()
+
+        def hang() -> None:
+            hangs.set()
+            self._resumes.wait(20.0)
+
+        self._loop.call_soon_threadsafe(hang)
+        assert hangs.wait(20.0)
 
     def stop(self) -> None:
         self.run(self._client.stop())

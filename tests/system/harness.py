@@ -875,8 +875,11 @@ class Bus:
 
 
 @contextmanager
-def repeated(send: Callable[[], object]) -> Iterator[threading.Event]:
-    """Call `send` 20 times a second while the body runs, or until the event is set."""
+def repeated(send: Callable[[], object]) -> Iterator[Callable[[], object]]:
+    """Call `send` 20 times a second while the body runs, or until it calls the given function.
+
+    When that function returns, the last call of `send` has ended.
+    """
     silenced = threading.Event()
 
     def repeat() -> None:
@@ -884,13 +887,16 @@ def repeated(send: Callable[[], object]) -> Iterator[threading.Event]:
             send()
             silenced.wait(0.05)
 
+    def silence() -> None:
+        silenced.set()
+        thread.join()
+
     thread = threading.Thread(target=repeat)
     thread.start()
     try:
-        yield silenced
+        yield silence
     finally:
-        silenced.set()
-        thread.join()
+        silence()
 
 
 class Commander:
@@ -899,12 +905,12 @@ class Commander:
     def __init__(self, bus: Bus, key: str, linear: float, angular: float) -> None:
         self.key, self.sender = key, f"commander/{secrets.token_hex(16)}"
         self.wish = twist(linear, angular)
-        self.silenced = threading.Event()
         self._bus = bus
 
     @contextmanager
     def sending(self) -> Iterator[None]:
-        with repeated(lambda: self._bus.put(self.key, self.wish, self.sender)) as self.silenced:
+        """Send while the body runs, or until it calls `silence`."""
+        with repeated(lambda: self._bus.put(self.key, self.wish, self.sender)) as self.silence:
             yield
 
 

@@ -71,17 +71,6 @@ class Hosts:
         self._add_neighbour(self.stranger, ROBOT_AT, CARDS[ROBOT_AT])
         self._add_neighbour(self.robot, STRANGER_AT, CARDS[STRANGER_AT])
 
-    @contextmanager
-    def narrow(self) -> Iterator[None]:
-        """Let 8 Mbit/s through from the robot, with a buffer of 100 ms, while the body runs."""
-        shaper = ("dev", "cable", "root")
-        tc("-n", self.robot, "qdisc", "add", *shaper, "tbf", "rate", "8mbit", "burst", "16kb",
-           "latency", "100ms")  # fmt: skip
-        try:
-            yield
-        finally:
-            tc("-n", self.robot, "qdisc", "delete", *shaper)
-
     @staticmethod
     def _add_neighbour(host: str, to: str, card: str) -> None:
         ip("-n", host, "neighbour", "replace", to, "lladdr", card, "dev", "cable",
@@ -119,11 +108,6 @@ def _enter(namespace: int) -> None:
 def ip(*arguments: str, check: bool = True) -> None:
     """Run the program `ip` with these arguments. Fails on an error if `check` is set."""
     subprocess.run(["ip", *arguments], check=check, capture_output=True, timeout=10.0)
-
-
-def tc(*arguments: str) -> None:
-    """Run the program `tc` with these arguments."""
-    subprocess.run(["tc", *arguments], check=True, capture_output=True, timeout=10.0)
 
 
 def two_hosts() -> Iterator[Hosts]:

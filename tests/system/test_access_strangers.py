@@ -27,7 +27,7 @@ from tests.system.harness import (
     until,
 )
 from tests.system.hosts import Hosts, inside, on
-from tests.system.identities import Certificates, Gated, Identity
+from tests.system.identities import Certificates, Gated
 from tests.system.strangers import command_line
 
 pytestmark = pytest.mark.network
@@ -229,30 +229,27 @@ def certificates(tmp_path_factory: pytest.TempPathFactory) -> Certificates:
     return Certificates(tmp_path_factory.mktemp("certificates"))
 
 
-def attacked(
-    robot: Gated, kind: str, comers: tuple[Identity, ...], count: int
-) -> tuple[Periods, int, float, float]:
-    """Attack the TLS gateway of a daemon, whose clients are connected or come again and again.
+def attacked(robot: Gated, kind: str, count: int) -> tuple[Periods, int, float, float]:
+    """Attack the TLS gateway of a daemon. The attacker may make that unreachable, and nothing else.
 
-    The attacker has a viewer's certificate for attacks that need one. Returns the control periods,
-    the daemon's growth in kB, and the longest waits of a connected operator for an answer, and of a
-    newcomer until it is connected and answered, in s.
+    It has a viewer's certificate for attacks that need one. Returns the control periods, the
+    daemon's growth in kB, and the longest waits of a connected client on the robot's machine for an
+    answer, and of a new one until it is connected and answered, in s.
     """
     viewer = json.dumps(robot.certificates.settings(robot.certificates.own("viewer")))
     words = command_line(ATTACK, kind, robot.tls, viewer, ATTACK_S, count)
     answers, entries, most_kb = [0.0], [0.0], 0
-    with robot.daemon, Bus(robot.plain) as bus, robot.opened("operator") as operator:
+    with robot.daemon, Bus(robot.plain) as bus:
         bus.linked()
         memory_kb, before = resident_kb(robot.daemon.pid), bus.state()
         with Program(words, robot.daemon.config.parent) as attack:
             attack.says("begun")
             end = time.monotonic() + max(ATTACK_S, count / 1000)
             while len(entries) == 1 or (attack.process.poll() is None and time.monotonic() < end):
-                answers.append(answered(operator))
-                for identity in comers:
-                    begun = time.monotonic()
-                    until(lambda: robot.lets_in(identity), 20.0, "it gets in")  # noqa: B023
-                    entries.append(time.monotonic() - begun - lost(begun))
+                answers.append(answered(bus.session))
+                begun = time.monotonic()
+                until(lambda: robot.lets_in("local"), 20.0, "it gets in")
+                entries.append(time.monotonic() - begun - lost(begun))
                 most_kb = max(most_kb, resident_kb(robot.daemon.pid) - memory_kb)
         periods = Periods.between(before, bus.state())
     return periods, most_kb, max(answers), max(entries)
@@ -268,33 +265,19 @@ def answered(session: zenoh.Session) -> float:
     return time.monotonic() - begun - lost(begun)
 
 
-BOTH: tuple[Identity, ...] = ("local", "operator")
-
-
 @pytest.mark.parametrize(
-    ("kind", "count", "comers", "entered_s"),
-    [
-        pytest.param("flood", 0, BOTH, 2.0, marks=pytest.mark.nightly),
-        ("huge", 0, BOTH, 2.0),
-        ("idle", 300, BOTH, 2.0),
-        # Zenoh 1.10 waits 100 ms after each TLS handshake that fails (its issue 2685). No setting
-        # mends that.
-        ("garbage", 25, ("operator",), 2.0 + 25 * 0.1),
-    ],
-)
-def test_an_attack_by_force_costs_no_tick_and_keeps_no_client_out(
-    tmp_path: Path,
-    certificates: Certificates,
-    kind: str,
-    count: int,
-    comers: tuple[Identity, ...],
-    entered_s: float,
+    ("kind", "count"),
+    [pytest.param("flood", 0, marks=pytest.mark.nightly), ("huge", 0), ("idle", 300),
+     ("garbage", 25)],
+)  # fmt: skip
+def test_an_attack_by_force_costs_no_tick_and_keeps_no_local_client_out(
+    tmp_path: Path, certificates: Certificates, kind: str, count: int
 ) -> None:
     begun = time.monotonic()
     robot = Gated(tmp_path, certificates)
-    periods, grown_kb, answered_s, took_s = attacked(robot, kind, comers, count)
+    periods, grown_kb, answered_s, took_s = attacked(robot, kind, count)
     print(f"{kind}: {periods}, {grown_kb:+d} kB, {answered_s:.3f} s, {took_s:.3f} s")
     assert periods.missed <= 0.01 * periods.elapsed + 4 + 100.0 * lost(begun)
     assert grown_kb < 64_000
     assert answered_s < 1.0
-    assert took_s < entered_s
+    assert took_s < 2.0

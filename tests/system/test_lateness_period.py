@@ -92,7 +92,7 @@ def test_a_sender_that_repeats_its_speed_has_the_lines_of_the_periods(tmp_path: 
         bus.linked()
         with bus.commanding(0.4) as commander:
             time.sleep(1.0)
-            commander.silenced.set()
+            commander.silence()
             begun, waited = time.monotonic(), waited_for_a_core(daemon.pid)
             dice = random.Random(1)
             for number in range(80):

@@ -6,11 +6,10 @@ import asyncio
 import math
 import os
 import socket
-import ssl
 import time
 import urllib.request
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -20,11 +19,10 @@ from yarl import URL
 
 from acsard.web.access import REQUEST_RATE
 from acsard.web.app import BODY_TIMEOUT_S
-from acsard.web.connections import IDLE_S, MAX_LOCAL, UNREAD_S
+from acsard.web.connections import IDLE_S, UNREAD_S
 from tests.system.browser import NAME, Hands, Page, hands
 from tests.system.bystander import lost
-from tests.system.harness import PATIENCE_S, Bus, Program, resident_kb, until
-from tests.system.strangers import command_line
+from tests.system.harness import PATIENCE_S, Bus, resident_kb, until
 
 pytestmark = pytest.mark.network
 
@@ -217,54 +215,6 @@ async def test_a_flood_of_a_viewer_ends_its_connections_and_delays_no_stop_of_an
     assert {200, 429} <= statuses
 
 
-FLOOD = """\
-import asyncio, aiohttp, os, ssl, sys
-from contextlib import suppress
-os.nice(19)
-url, token, message = sys.argv[1:]
-
-async def flood(session):
-    while True:
-        with suppress(aiohttp.ClientError, ConnectionError):
-            async with session.ws_connect(url + "/ws", ssl=False) as socket:
-                for number in range(2000):
-                    await socket.send_str(message)
-                async for _ in socket:
-                    pass
-
-async def main():
-    headers = {"Authorization": "Bearer " + token}
-    async with aiohttp.ClientSession(headers=headers) as session:
-        floods = [asyncio.create_task(flood(session)) for _ in range(8)]
-        await asyncio.sleep(1.0)
-        print("floods", flush=True)
-        await asyncio.wait(floods)
-
-asyncio.run(main())
-"""
-"""Sends this message without end over eight WebSockets, each of which it opens again and again."""
-
-
-@pytest.mark.nightly
-@pytest.mark.parametrize("message", ['{"call":"stop"}', '{"ping":1}'])
-async def test_floods_on_all_sockets_of_a_viewer_delay_no_stop_of_another(
-    target: Target, message: str
-) -> None:
-    page = target.page
-    with target.refuses("too_fast", 8):
-        async with hands(page, page.invite("operator", f"phone-{time.time_ns()}")) as ours:
-
-            async def stop() -> None:
-                assert (await ours.call("stop"))["ok"]
-
-            words = command_line(FLOOD, page.away, target.tokens["viewer"], message)
-            with Program(words, page.tls) as program:
-                await asyncio.to_thread(program.says, "floods", PATIENCE_S)
-                assert await longest(stop) < 0.5
-        await asyncio.sleep(1.5)  # the last connections end
-        assert target.bus.get("srv/clear")["success"]
-
-
 async def drained(ours: Hands) -> list[str]:
     """Return the texts that come until the connection ends."""
     async with asyncio.timeout(PATIENCE_S):
@@ -304,44 +254,6 @@ async def test_a_socket_that_floods_with_any_message_ends_and_no_other_does(
         await ours.find(lambda frame: "pong" in frame)
 
 
-async def test_a_thousand_connections_do_not_disconnect_the_page_that_drives(
-    target: Target,
-) -> None:
-    counted = target.page.refused().get("crowded", 0)
-    async with hands(target.page) as ours:
-        await ours.say(subscribe="state", rate=50)
-        await ours.until_driving(0.3)
-        holding = asyncio.create_task(ours.hold(0.3, PATIENCE_S))
-        idle = []
-        for _ in range(1000):
-            idle.append(socket.socket())
-            idle[-1].setblocking(False)
-            at = ("127.0.0.1", target.port)
-            await asyncio.get_running_loop().sock_connect(idle[-1], at)
-        await ours.say(ping=7)
-        await ours.find(lambda frame: frame.get("pong") == 7)
-        await ours.state(lambda s: s["mode"] == "driving")
-        async with asyncio.timeout(PATIENCE_S):
-            while sum(map(_is_open, idle)) >= MAX_LOCAL:  # one place is that of the page
-                await asyncio.sleep(0.01)
-        holding.cancel()
-        for idle_socket in idle:
-            idle_socket.close()
-        await ours.drive(0.0)
-        target.bus.at_rest()
-    assert target.page.refused()["crowded"] >= counted + 1000 - MAX_LOCAL
-
-
-def _is_open(sock: socket.socket) -> bool:
-    """Return whether the server still keeps this connection open."""
-    try:
-        return sock.recv(1) != b""
-    except BlockingIOError:
-        return True
-    except ConnectionError:
-        return False
-
-
 @pytest.mark.parametrize("before", [b"", b"GET / HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n"])
 def test_a_head_without_an_end_is_cut_off(target: Target, before: bytes) -> None:
     """Send endless headers, in the first request of a connection or in the second.
@@ -359,32 +271,6 @@ def test_a_head_without_an_end_is_cut_off(target: Target, before: bytes) -> None
             sent += 3000
             time.sleep(0.005)
     assert sent < 300_000
-
-
-@pytest.mark.nightly
-def test_answers_that_no_client_reads_cost_little_memory(target: Target) -> None:
-    """Sixty clients without a token send requests all the time, and read no answer."""
-    page, place = target.page, URL(target.page.away)
-    trusting = ssl._create_unverified_context()
-    headers = "".join(f"X-{n}: {'x' * 200}\r\n" for n in range(28))
-    request = f"GET /x HTTP/1.1\r\nHost: {place.host}:{place.port}\r\n{headers}\r\n"
-    with ExitStack() as stack:
-        greedy = []
-        for _ in range(60):
-            client = socket.socket()
-            client.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
-            client.connect(("127.0.0.1", place.port))
-            greedy.append(stack.enter_context(trusting.wrap_socket(client)))
-            greedy[-1].setblocking(False)
-        before, most, end = resident_kb(page.pid), 0, time.monotonic() + UNREAD_S - 1.0
-        while time.monotonic() < end:
-            for client in greedy:
-                with suppress(OSError):
-                    client.send(request.encode() * 20)
-            most = max(most, resident_kb(page.pid) - before)
-            time.sleep(0.01)
-    print(f"\n60 clients that read no answers: {most / 1000:+.1f} MB")
-    assert most < 36_000
 
 
 @pytest.mark.nightly

@@ -6,8 +6,6 @@ its touches, keys and clicks, its cookies, and its rules for scripts.
 
 from __future__ import annotations
 
-import asyncio
-import re
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -16,9 +14,8 @@ import pytest
 
 from acsard.cli import command_line
 from acsard.machine.authority import Authority
-from acsard.web.viewer import PING_INTERVAL_S
-from tests.system.browser import NAME, TRUSTING, Page, text
-from tests.system.chromium import CHROMIUM, DESKTOP, PHONE, RED, SETTLED_S, browsing
+from tests.system.browser import NAME, TRUSTING, Page
+from tests.system.chromium import CHROMIUM, PHONE, RED, browsing
 from tests.system.harness import running as running_daemon
 from tests.system.harness import until
 from tests.system.phone_page import HELD, Phone, alone
@@ -80,74 +77,6 @@ def test_keys_drive_while_they_are_held_also_after_the_slider_was_set(phone: Pho
     assert browser.js(HELD) is False
 
 
-def test_releasing_the_left_mouse_button_while_another_is_held_releases_the_stick(
-    phone: Phone,
-) -> None:
-    """While another mouse button is down, the browser sends no `pointerup` for the left one."""
-    browser = phone.browser
-    browser.size(*DESKTOP, touch=False)
-    x, y = browser.middle("stick")
-
-    def drives() -> bool:
-        if not browser.js(HELD):  # a busy machine may make the page release it
-            browser.mouse("Released", (x, y), buttons=0)
-            browser.mouse("Pressed", (x, y))
-            browser.mouse("Moved", (x, y - 90), "none")
-        return moves(phone)
-
-    until(drives, 10.0, "it drives")
-    browser.mouse("Pressed", (x, y - 90), "right", buttons=3)
-    browser.mouse("Released", (x, y - 90), "left", buttons=2)
-    phone.shows("hint", "another button is down")
-    phone.bus.at_rest()
-    browser.mouse("Released", (x, y - 90), "right", buttons=0)
-
-
-CORNER = """(b => [b.x + 40, b.y + b.height / 2])(
-    document.getElementById('stop').getBoundingClientRect())"""
-"""The part of STOP at whose place the button that releases STOP appears."""
-
-
-def test_taps_clicks_and_a_held_key_release_only_what_the_button_said_a_second_before(
-    phone: Phone,
-) -> None:
-    browser, bus = phone.browser, phone.bus
-    corner = browser.js(CORNER)
-    for _ in range(3):
-        browser.touch("Start", corner)
-        browser.touch("End")
-        time.sleep(0.3)
-    assert bus.state()["mode"] == "stopped"
-    phone.shows("complaint", "This button has just appeared or changed, or was pressed")
-    browser.release()
-    phone.shows("mode", "READY")
-    bus.get("srv/deactivate")
-    bus.get("srv/stop")
-    phone.shows("clear", "Release STOP")
-    browser.settle()
-    for count in (1, 2):  # a double click
-        browser.mouse("Pressed", browser.middle("clear"), clicks=count)
-        browser.mouse("Released", browser.middle("clear"), buttons=0, clicks=count)
-        time.sleep(0.25)
-    phone.shows("clear", "Switch on")
-    assert bus.state()["mode"] == "inactive"
-    bus.get("srv/stop")
-    phone.shows("clear", "Release STOP")
-    browser.settle()
-    browser.js("document.getElementById('clear').focus()")
-    enter = {"text": "\r", "windowsVirtualKeyCode": 13}
-    for n in range(8):
-        browser.key("Down", "Enter", "Enter", autoRepeat=n > 0, **enter)
-        time.sleep(0.2)
-    browser.key("Up", "Enter", "Enter")
-    phone.shows("clear", "Switch on")
-    assert bus.state()["mode"] == "inactive"
-    time.sleep(SETTLED_S)
-    browser.key("Down", "Enter", "Enter", **enter)
-    browser.key("Up", "Enter", "Enter")
-    phone.shows("mode", "READY")
-
-
 SET = """(() => {
     const button = document.querySelector('[aria-label="Set limits.linear_speed"]');
     if (!button) return false;
@@ -186,27 +115,6 @@ def test_settings_reach_the_robot_and_text_of_strangers_is_only_shown(phone: Pho
     assert browser.js("document.querySelectorAll('#happened img').length") == 0
     assert browser.js("document.title") == "READY · acsar"
     assert browser.js(ADDED) is False
-
-
-def viewers(page: Page) -> int:
-    """Return the number of open pages that the page's server counts."""
-    metrics = asyncio.run(text(f"{page.here}/metrics"))
-    return int(re.findall(r"^acsard_page_viewers\{.*\} (\d+)(?:\.0)?$", metrics, re.MULTILINE)[0])
-
-
-@pytest.mark.nightly
-@alone
-def test_a_page_disconnects_when_it_is_left_and_reconnects_after_going_back(phone: Phone) -> None:
-    """The browser keeps a page that a person has left, so the page itself must disconnect."""
-    browser, left = phone.browser, time.monotonic()
-    browser.open("about:blank")
-    until(lambda: viewers(phone.server) == 0, 5.0, "no page is open")
-    assert time.monotonic() - left < PING_INTERVAL_S, "the server had to find out"
-    browser.js("history.back()")
-    phone.shows("age", "live")
-    phone.shows("mode", "READY")
-    phone.hold()
-    browser.touch("End")
 
 
 @pytest.fixture

@@ -59,7 +59,7 @@ def daemon(_: Path) -> str:
         driven = running.command(15.0, staircase)
         memory = resident_kb(running.process.pid) / 1000
         threads = len(list(Path(f"/proc/{running.process.pid}/task").iterdir()))
-        counters = running.state().counters
+        counters = running.bus.state()["counters"]
         record = running.end()
     waits, delays = waits_us(record), delays_us(settings, record)
     with rig(config(), POLLED) as polled:

@@ -1,7 +1,8 @@
 """Random drives, the lines that an MCU makes from them, and the times at which a host reads them.
 
-The tests compare the pose of the session under test with that of the encoders' counts. The seed
-determines all random numbers. Times are in s.
+The tests compare the pose of the session under test with that of the encoders' counts. No motor is
+simulated: the path is given at each instant, so that an error of a pose is one of the link's times
+only. The seed determines all random numbers. Times are in s.
 """
 
 from __future__ import annotations
@@ -22,6 +23,7 @@ from acsard.core.link.feedback import Line
 from acsard.core.link.link_output import QUESTION_LINE, Output
 from acsard.core.link.link_setup import LinkSetup
 from acsard.core.link.session import McuSession
+from acsard.core.simulator.vehicle import whole_counts
 from acsard.core.values import AT_REST, NS_PER_S, Instant, Pose, Received, WheelSpeeds
 from tests.unit.odometer import Odometer, arc
 
@@ -163,10 +165,12 @@ class Host:
         wheels = (right, left, left, right)[: len(self.case.wheels.names)]
         if not self.case.counts:
             return wheels
-        step = math.tau / self.case.counts
+        per_turn = self.case.counts
         # The edges of the encoders are not at the same angles.
         edges = zip(wheels, (0.0, 0.6, 0.1, 0.4), strict=False)
-        return tuple(math.floor(angle / step + edge) * step for angle, edge in edges)
+        return tuple(
+            whole_counts(angle, per_turn, edge) * math.tau / per_turn for angle, edge in edges
+        )
 
     # the path to the host
 

@@ -1,5 +1,8 @@
 """Simulated skid-steer robots and their logs. This module uses none of the code under test.
 
+It does not use the simulator either: the calibration is judged by a robot that skids, slips and
+counts by other equations than those from which it computes the settings.
+
 It integrates the true motion in steps of 5 ms. The wheels report their mean speed of each period at
 100 Hz in two decimals. The gyro has its own rate, a delay, a bias and noise. Positions come at 5
 Hz.

@@ -2,8 +2,9 @@
 
 The tests compute NEES from them. This module implements only the declared error model
 (`acsard.toml`, the docstring of `core/motion/error_model.py`) in numpy, for many robots at once. It
-shares no code with the module that it tests. The encoders report exactly the commanded speeds. The
-ground and the robot's true size change the actual motion.
+shares no code with the module that it tests, nor with the simulator: it moves a thousand robots in
+one step. The encoders report exactly the commanded speeds. The ground and the robot's true size
+change the actual motion.
 
 NEES is e' P^-1 e, with e = log(estimate^-1 truth) and P the published covariance rotated by -yaw.
 If P is right, the mean of NEES over many runs is 3, and 95 % of its values are below 7.815.

@@ -1,7 +1,9 @@
 """Simulated robots of any size that drive at random, and report what their encoders count.
 
-The product's limiter and kinematics give the commands. Each motor follows its own with a
-first-order lag, some behind a dead time, and some coast. The seed determines all that a robot does.
+The product's limiter and kinematics give the commands, and its simulator the motors and encoders.
+An hour of a whole daemon takes ten times as long, so what a `FakeMcu` has not is here: motors and
+tyres that differ from wheel to wheel, rough ground, a dead time, and motors that coast. The seed
+determines all that a robot does.
 """
 
 from __future__ import annotations
@@ -26,6 +28,7 @@ from acsard.core.motion.wheels import (
     count_angle,
     new_wheels,
 )
+from acsard.core.simulator.vehicle import approach, whole_counts
 from acsard.core.values import WHEELS, Motion, Twist, Wheels4, WheelSpeeds
 from tests.wheels import FOUR
 
@@ -121,7 +124,7 @@ class Bench:
         self.now = 0.0
         self.speeds = [0.0] * self.driven
         self.angles = [dice.uniform(0.0, self.unit) for _ in self.speeds]
-        self.counted = [math.floor(angle / self.unit) for angle in self.angles]
+        self.counted = [whole_counts(angle, robot.counts, 0.0) for angle in self.angles]
         self.lags = [robot.lag * dice.uniform(0.9, 1.1) for _ in self.speeds]
         self.sizes = [dice.uniform(0.985, 1.015) for _ in self.speeds]
         self.gain = 1.0  # slopes and bumps
@@ -164,14 +167,15 @@ class Bench:
             if self.hand is None and abs(goal) < abs(before) and goal * before >= 0.0:
                 lag *= self.coasts
             goal *= self.dice.uniform(0.98, 1.02) if self.rough else 1.0
-            speed = before if i in self.keeps else goal + (before - goal) * math.exp(-dt / lag)
-            self.speeds[i] = speed
-            moved = (before + speed) / 2 * dt * self.slips.get(i, 1.0)
+            if i in self.keeps:
+                goal = before
+            self.speeds[i], moved = approach(before, goal, dt, lag)
+            moved *= self.slips.get(i, 1.0)
             moved *= self.dice.uniform(0.95, 1.05) if self.rough else 1.0
             self.angles[i] += moved
             if i in self.keeps:
                 self.excess += (moved - told[i] * dt) * self.robot.radius / len(self.keeps)
-            counted = math.floor(self.angles[i] / self.unit)
+            counted = whole_counts(self.angles[i], self.robot.counts, 0.0)
             counts, self.counted[i] = counted - self.counted[i], counted
             counts = 0 if i in self.dead else counts * self.signs.get(i, 1)
             speeds[i] = self.frozen.get(i, round(counts * self.unit / dt, 2))

@@ -203,7 +203,7 @@ def lines(finding: Finding) -> Iterator[str]:
         yield f"        -> {finding.mend}"
 
 
-DAILY = ("good", "motors", "hardware", "two_wheels")
+DAILY = ("motors", "hardware", "two_wheels", "course")
 
 
 @pytest.mark.parametrize(
@@ -264,6 +264,7 @@ class Coupled(Robot):
         vars(self.mcu)["understand"] = understand
 
 
+@pytest.mark.variations(3)
 @FOUR_AND_TWO
 @pytest.mark.parametrize(("fault", "verdict"), [((), "PASS"), (("no_watchdog",), "FAIL")])
 def test_coupled_motors_show_the_watchdog_too(

@@ -141,6 +141,7 @@ def test_a_check_that_stalled_while_a_motor_turned_turns_no_motor_again(
     assert (len(questions) > 1) == (turning > 1)
 
 
+@pytest.mark.variations(7)
 @pytest.mark.parametrize("asleep", [False, True], ids=["stopped", "suspended"])
 @pytest.mark.parametrize(("seconds", "ends"), [(0.6, False), (4.5, False), (60.0, True)])
 def test_before_a_wheel_has_turned_only_a_long_stall_ends_the_check(

@@ -246,7 +246,7 @@ def test_a_night_at_rest_with_lost_lines_costs_less_than_a_decimetre(
     robot = Odometer(counts=counts, wheels=wheels)
     for _ in range(50):
         before = robot.fold(line(0.0)).covariance
-    gaps, times = round(0.01 * 12 * 3600 / lost), 20  # each adds as much as the others
+    gaps, times = round(0.01 * 12 * 3600 / lost), 100  # each adds as much as the others
     for _ in range(gaps // times):
         after = robot.fold(line(0.0, lost + 0.01, bridged=lost)).covariance
     assert 0.0 < math.sqrt(times * (after.xx - before.xx)) < 0.1

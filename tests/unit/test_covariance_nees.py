@@ -168,7 +168,9 @@ def gap_errors(wheels: WheelMap, lost: int, rng: np.random.Generator) -> tuple[f
     return distance**2, turn**2, *variances, after.covariance.yawyaw - before
 
 
-@pytest.mark.parametrize(("wheels", "lost"), [(FOUR, 20), (TWO, 20), (TWO, 1)])
+@pytest.mark.slow
+@pytest.mark.variations(3)
+@pytest.mark.parametrize(("wheels", "lost"), [(TWO, 20), (FOUR, 20), (TWO, 1)])
 def test_the_counts_around_a_gap_are_in_the_covariance(wheels: WheelMap, lost: int) -> None:
     rng = np.random.default_rng(1)
     errors = np.array([gap_errors(wheels, lost, rng) for _ in range(300)])

@@ -16,6 +16,7 @@ from aiohttp import web
 
 from acsard.web import connections
 from acsard.web.access import REQUEST_RATE
+from acsard.web.callers import network_of
 from acsard.web.connections import (
     HANDSHAKE_S,
     IDLE_S,
@@ -108,6 +109,17 @@ class Owned:
 
     def aborted(self) -> list[HttpConnection]:
         return [one for one in self.made if cast(Mock, one.transport).abort.called]
+
+
+@pytest.mark.parametrize("peer", ["192.168.1.9", "fd00:77::1"])
+async def test_a_connection_that_has_left_gives_back_the_place_of_its_network(peer: str) -> None:
+    """Otherwise a network that has come and gone 64 times would be locked out."""
+    places, every = Places(MAX_CONNECTIONS, 1), Connections(Counts())
+    assert places.enter(network_of(peer))
+    connection = HttpConnection(every, web.Server(_not_found), peer, places)
+    every._all.add(connection)
+    every.left(connection)
+    assert places.room(network_of(peer))
 
 
 async def test_a_token_with_all_its_connections_loses_an_idle_one_to_a_new_one() -> None:

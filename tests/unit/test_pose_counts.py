@@ -205,6 +205,7 @@ def test_one_damaged_line_does_not_refute_whole_counts() -> None:
     assert counter.believed
 
 
+@pytest.mark.variations(4)
 @each("driven", DRIVEN)
 @pytest.mark.parametrize(
     ("lost", "counts", "most"),

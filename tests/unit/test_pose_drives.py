@@ -40,7 +40,7 @@ def check(name: str, case: Case, mm: float, deg: float) -> None:
     assert turned <= deg
 
 
-@pytest.mark.variations(4)
+@pytest.mark.variations(17)
 @pytest.mark.parametrize("stall", [0.0, STALL])
 @four_and_two
 @pytest.mark.parametrize(
@@ -57,7 +57,7 @@ def test_a_board_that_answers_within_5_ms_is_where_its_counts_say(
     check(f"prompted, {counts} counts, stalls of {stall} s", case, *bound)
 
 
-@pytest.mark.variations(3)
+@pytest.mark.variations(13)
 @pytest.mark.parametrize("stall", [0.0, STALL])
 @pytest.mark.parametrize("counts", [20, 96, 3200])
 @four_and_two
@@ -72,7 +72,7 @@ def test_a_free_running_board_is_where_its_counts_say(
     )
 
 
-@pytest.mark.variations(3)
+@pytest.mark.variations(13)
 @pytest.mark.parametrize("counts", [20, 96, 3200])
 @pytest.mark.parametrize("adapter", ADAPTERS)
 @four_and_two

@@ -80,7 +80,9 @@ def test_sound_robots_with_a_dead_time_or_that_coast_latch_no_fault(
         assert said.faults == [], (seed, made)
 
 
-@pytest.mark.parametrize("count", [60, pytest.param(400, marks=SOAK)])
+@pytest.mark.parametrize(
+    "count", [10, pytest.param(60, marks=pytest.mark.slow), pytest.param(400, marks=SOAK)]
+)
 @pytest.mark.parametrize("flickers", [False, True])
 @four_and_two
 def test_motors_that_keep_their_speed_under_a_moving_stick_are_found_within_two_metres(

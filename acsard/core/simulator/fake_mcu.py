@@ -27,7 +27,7 @@ from acsard.core.config.simulated_faults import (
 )
 from acsard.core.config.wire_time import wire_ns
 from acsard.core.simulator import protocol
-from acsard.core.simulator.vehicle import Vehicle
+from acsard.core.simulator.vehicle import Vehicle, whole_counts
 from acsard.core.values import NS_PER_S, Ns
 
 MS = 1_000_000
@@ -326,9 +326,8 @@ class FakeMcu:
     def _count(self) -> list[int]:
         angles = self._vehicle.angles
         if angles != self._angles:
-            floor, tau, per_turn = math.floor, math.tau, self._counts
             self._angles = angles.copy()
-            self._seen = [floor(f * angles[w[0]] / tau * per_turn + 0.5) for w, f in self._wiring]
+            self._seen = [whole_counts(f * angles[w[0]], self._counts) for w, f in self._wiring]
         return self._seen
 
     def _speeds(self, now_ns: Ns) -> list[float]:

@@ -10,9 +10,27 @@ import math
 
 from acsard.core.config.settings import DriveConfig, SimConfig
 from acsard.core.motion.kinematics import on_arc
-from acsard.core.values import Pose
+from acsard.core.values import Pose, Rad, RadPerS, Seconds
 
 PUSH_TIME_CONSTANT_S = 0.1  # of the wheel speeds, towards a person's who pushes the robot
+
+
+def approach(speed: RadPerS, goal: RadPerS, dt: Seconds, lag: Seconds) -> tuple[RadPerS, Rad]:
+    """Return the speed of a motor after `dt`, and the angle that its wheel turns meanwhile.
+
+    The angle is the exact integral of the exponential approach to `goal`, so the path does not
+    depend on the size of `dt`.
+    """
+    rest = math.exp(-dt / lag) if lag else 0.0
+    error = speed - goal
+    angle = goal * dt + error * lag * (1.0 - rest)
+    speed = goal + error * rest
+    return speed if abs(speed) > 1e-9 else 0.0, angle
+
+
+def whole_counts(angle: Rad, per_turn: int, edge: float = 0.5) -> int:
+    """Return what an encoder has counted that had `edge` of a count at 0 rad."""
+    return math.floor(angle / math.tau * per_turn + edge)
 
 
 class Vehicle:
@@ -46,16 +64,10 @@ class Vehicle:
             goals, lag = [point * fraction for point in self.set_points], self._lag
         if not (any(goals) or any(self.speeds)):
             return
-        rest = math.exp(-dt / lag) if lag else 0.0
-        progress, turned, speeds, angles = 1.0 - rest, [0.0] * 4, self.speeds, self.angles
+        turned, speeds, angles = [0.0] * 4, self.speeds, self.angles
         for i, goal in enumerate(goals):
-            error = speeds[i] - goal
-            # This is the exact integral of the exponential approach, so the path does not depend on
-            # the size of dt.
-            angle = turned[i] = goal * dt + error * lag * progress
-            speed = goal + error * rest
-            speeds[i] = speed if abs(speed) > 1e-9 else 0.0
-            angles[i] += angle
+            speeds[i], turned[i] = approach(speeds[i], goal, dt, lag)
+            angles[i] += turned[i]
         left = self._left_radius * (turned[1] + turned[2]) / 2
         right = self._right_radius * (turned[0] + turned[3]) / 2
         turn = (right - left) / self._track * (1.0 - self.turn_slip)
