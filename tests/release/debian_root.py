@@ -12,15 +12,14 @@ import subprocess
 import sys
 import tempfile
 import tomllib
-import venv
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from hashlib import md5
 from pathlib import Path
 
+from acsard import __version__
+from acsard.host.version import DIRTY, full_version, source_of
 from tests.system.harness import ROOT
-
-RELEASE = ROOT / "deploy" / "release"
 
 SYSTEMS = {"deb12": "bookworm", "deb13": "trixie", "ubuntu24.04": "noble"}
 PYTHONS = {"deb12": "3.11", "deb13": "3.13", "ubuntu24.04": "3.12"}
@@ -30,8 +29,10 @@ UBUNTU = (
     "http://archive.ubuntu.com/ubuntu noble main universe"
 )
 
-NUMBER, NEWER = "0.2.0.dev1", "0.2.0.dev2"
-"""The version of the packages, and that of copies which only have another version."""
+COMMIT = source_of(ROOT).removesuffix(DIRTY)
+
+NUMBER = full_version(__version__, COMMIT)  # of the packages
+NEWER = f"9{NUMBER[1:]}"  # of copies which only have another version
 
 BINFMT = Path("/proc/sys/fs/binfmt_misc")
 
@@ -59,40 +60,19 @@ def runs_arm64() -> bool:
     return entry.exists() and "F" in entry.read_text().split("flags:")[1].splitlines()[0]
 
 
-def packages(out: Path, tools: Path) -> list[Path]:
-    """Return the six packages of this clone in the directory `out`, with the version `NUMBER`.
+def packages(out: Path, commit: str = COMMIT) -> list[Path]:
+    """Return the packages of a commit, as its own release script makes them, in `out`.
 
-    If it does not exist, make them with a venv of the locked tools, in the directory `tools`.
+    If this directory is there, it has them.
     """
     if not out.exists():
-        python = str(tools / "bin" / "python")
-        if not tools.exists():
-            venv.create(tools, with_pip=True)
-            _run(python, "-m", "pip", "install", "-q", "-r", str(RELEASE / "requirements.lock"))
-        with tempfile.TemporaryDirectory() as work:
-            wheel = _wheel(python, Path(work))
-            made = Path(tempfile.mkdtemp(dir=out.parent))
-            _run(python, str(RELEASE / "debian.py"), str(wheel), str(made))
+        with tempfile.TemporaryDirectory(dir=out.parent) as work:
+            clone, made = Path(work, "clone"), Path(work, "made")
+            _run("git", "clone", "--quiet", str(ROOT), str(clone))
+            _run("git", "-C", str(clone), "checkout", "--quiet", commit)
+            _run(str(clone / "deploy/release/build"), "--out", str(made))
             made.rename(out)
     return sorted(out.glob("*.deb"))
-
-
-def _wheel(python: str, work: Path) -> Path:
-    # Of the files that git tracks, because others are not in a release. The tools add the manual.
-    git = ["git", "-c", "safe.directory=*", "ls-files", "-z", "--cached", "--others"]
-    listed = subprocess.run(
-        [*git, "--exclude-standard"], cwd=ROOT, capture_output=True, text=True, check=True
-    )
-    for name in filter(None, listed.stdout.split("\0")):
-        if (ROOT / name).is_file():
-            (work / name).parent.mkdir(parents=True, exist_ok=True)
-            shutil.copyfile(ROOT / name, work / name)
-    init = work / "acsard" / "__init__.py"
-    text, _, _ = init.read_text().rpartition("__version__")
-    init.write_text(f'{text}__version__ = "{NUMBER}"\n')
-    words = ("-m", "build", "--no-isolation", "--wheel", "--outdir", str(work), str(work))
-    _run(python, *words)
-    return next(work.glob("*.whl"))
 
 
 def package(made: Iterable[Path], system: str, machine: str) -> Path:

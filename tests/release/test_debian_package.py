@@ -30,8 +30,9 @@ from tests.system.chromium import CHROMIUM, PHONE, Browser, browsing
 from tests.system.harness import ROOT, Program, until
 from tests.system.hosts import inside, ip, on
 from tests.system.terminals import Terminal
+from tests.system.test_versions import OTHER
 from tests.systemd.container import CONFIG, GATEWAY, PAGE, UNIT, Board, Container
-from tests.systemd.test_upgrade import Robot, commanded
+from tests.systemd.test_upgrade import BAD, Robot, commanded
 
 pytestmark = [
     pytest.mark.systemd,
@@ -62,7 +63,7 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="session")
 def made(place: Path) -> list[Path]:
     """Provide the six packages."""
-    return packages(place / "packages", place / "tools")
+    return packages(place / "packages")
 
 
 @pytest.fixture
@@ -215,32 +216,24 @@ def test_an_upgrade_switches_nothing_and_purge_leaves_nothing(bare: Root) -> Non
     assert bare.files() == before
 
 
-def test_the_same_source_gives_the_same_bytes(
-    made: list[Path], place: Path, tmp_path: Path
-) -> None:
-    again = packages(tmp_path / "again", place / "tools")
-    assert [path.name for path in made] == [path.name for path in again]
-    for one, other in zip(made, again, strict=True):
-        assert one.read_bytes() == other.read_bytes(), one.name
-
-
 MANUAL = ("python3", "-c", "import urllib.request as url; "
           "print(url.urlopen('http://127.0.0.1:8080/docs').read().decode())")  # fmt: skip
 
 
-def _two_packages(bare: Root, made: list[Path]) -> tuple[Path, Path]:
-    """Give a root systemd and two packages of different versions, the older first."""
+def _copied(bare: Root, *debs: Path) -> None:
+    """Give a root systemd and packages."""
     bare.run("apt-get install --yes --no-install-recommends systemd-sysv dbus udev python3")
-    first = package(made, "deb12", "amd64")
-    shutil.copyfile(first, bare.path / first.name)
-    return first, newer(first, bare.path)
+    for deb in debs:
+        shutil.copyfile(deb, bare.path / deb.name)
 
 
 def test_the_first_installation_starts_the_service_and_no_upgrade_restarts_it(
     made: list[Path], place: Path, tmp_path: Path
 ) -> None:
     with root(place, "deb12", "amd64") as bare:
-        first, second = _two_packages(bare, made)
+        first = package(made, "deb12", "amd64")
+        second = newer(first, bare.path)
+        _copied(bare, first)
         with Container(bare.path, tmp_path, "acsard-deb") as container:
             done = container.run("dpkg", "--install", f"/{first.name}")
             assert done.code == 0, done.err
@@ -281,32 +274,38 @@ def test_the_first_installation_starts_the_service_and_no_upgrade_restarts_it(
             assert [path for path in left.out.split() if not path.startswith("/srv/acsard")] == []
 
 
-def test_service_upgrade_changes_to_a_package_and_rollback_back_with_the_stop_latched(
-    made: list[Path], place: Path, tmp_path: Path
+@pytest.fixture(scope="session")
+def before(place: Path) -> list[Path]:
+    """Provide the packages of the release before this one."""
+    return packages(place / "before", OTHER)
+
+
+@pytest.mark.parametrize("system", ["deb12", "deb13"])
+def test_the_release_before_is_upgraded_and_back_and_goes_back_from_a_bad_version(
+    system: str, before: list[Path], made: list[Path], place: Path, tmp_path: Path
 ) -> None:
-    with root(place, "deb12", "amd64") as bare:
-        first, second = _two_packages(bare, made)
+    first, second = (package(debs, system, "amd64") for debs in (before, made))
+    old = first.name.removeprefix("acsard_").partition("-")[0]
+    with root(place, system, "amd64") as bare:
+        _copied(bare, first, second)
         with Container(bare.path, tmp_path, "acsard-deb") as container, Board(container) as board:
             done = container.run("dpkg", "--install", f"/{first.name}")
             assert done.code == 0, done.err
-            robot = Robot(container, board, NUMBER)
+            robot = Robot(container, board, old)
             until(robot.link, 60.0, "the link is up")
-            robot.stops()
+            for words in (
+                ("set", "limits.linear_speed", "0.4", "--keep", "--config", CONFIG),
+                ("web", "invite", "viewer", "--name", "tv", "--config", CONFIG),
+                ("call", "stop"),
+            ):
+                assert robot.types(*words).code == 0
             number, kept, recordings = robot.latch(), robot.kept(), robot.recordings()
-            assert number != "0"
+            assert (number != "0", len(kept) > 1, len(recordings)) == (True, True, 1)
             pid, began = container.main_pid(), time.monotonic()
 
-            for words, new, old in (
-                (("upgrade", f"/{second.name}"), NEWER, NUMBER),
-                (("rollback",), NUMBER, NEWER),
-            ):
-                change = commanded(robot, *words)
-                assert change.code == 0, change.out
-                assert (robot.readlink(), robot.readlink("previous"), robot.runs()) == (
-                    new, old, new,
-                )  # fmt: skip
-                assert container.main_pid() != pid
-                pid = container.main_pid()
+            def runs(new: str, previous: str) -> None:
+                links = (robot.readlink(), robot.readlink("previous"), robot.runs())
+                assert links == (new, previous, new)
                 info = robot.types("get", "info").out.replace(" ", "")
                 assert f'"version":"{new}"' in info
                 assert (robot.link(), robot.latch(), robot.kept()) == (True, number, kept)
@@ -314,6 +313,30 @@ def test_service_upgrade_changes_to_a_package_and_rollback_back_with_the_stop_la
                 # The unit in use is this version's own.
                 used = f"/opt/acsard/{new}/lib/acsard/deploy/systemd/{UNIT}"
                 container.types(f"cmp {used} /etc/systemd/system/{UNIT}", "/")
+
+            for how in ("crashes later", "has no link", "refuses the configuration"):
+                container.run("dpkg", "--install", f"/{second.name}")
+                Robot(container, board, NUMBER).makes("9.0.0", BAD[how])
+                change = commanded(robot, "upgrade", "/opt/acsard/9.0.0")
+                print(how, change.out, change.err, sep="\n")
+                assert change.code == 1
+                runs(old, "")
+
+            for words, new, previous in (
+                (("upgrade", f"/{second.name}"), NUMBER, old),
+                (("rollback",), old, NUMBER),
+                (("rollback",), NUMBER, old),
+            ):
+                change = commanded(robot, *words)
+                print(change.out, change.err)
+                assert change.code == 0, change.out
+                assert container.main_pid() != pid
+                pid = container.main_pid()
+                runs(new, previous)
             assert robot.moved(began) == []
+            shown = robot.types("recording", "--directory", "/var/lib/acsard/record")
+            assert shown.out.count("\n") > len(recordings)
+            assert '"linear_speed":0.4' in robot.types("get", "config").out.replace(" ", "")
+            assert robot.types("call", "clear").code == 0
             status = robot.types("service", "status").out
-            assert f"version {NEWER} is installed, but not in use" in status
+            assert f"version {old} is installed, but not in use" in status
