@@ -322,12 +322,12 @@ def test_the_release_before_is_upgraded_and_back_and_goes_back_from_a_bad_versio
                 assert change.code == 1
                 runs(old, "")
 
-            for words, new, previous in (
+            for change_words, new, previous in (
                 (("upgrade", f"/{second.name}"), NUMBER, old),
                 (("rollback",), old, NUMBER),
                 (("rollback",), NUMBER, old),
             ):
-                change = commanded(robot, *words)
+                change = commanded(robot, *change_words)
                 print(change.out, change.err)
                 assert change.code == 0, change.out
                 assert container.main_pid() != pid
