@@ -24,6 +24,8 @@ from tests.system.harness import ROOT
 SYSTEMS = {"deb12": "bookworm", "deb13": "trixie", "ubuntu24.04": "noble"}
 PYTHONS = {"deb12": "3.11", "deb13": "3.13", "ubuntu24.04": "3.12"}
 
+MACHINES = {"amd64": "x86_64", "arm64": "aarch64"}
+
 UBUNTU = (
     "deb [signed-by=/usr/share/keyrings/ubuntu-archive-keyring.gpg] "
     "http://archive.ubuntu.com/ubuntu noble main universe"
@@ -110,9 +112,9 @@ def debian_version(number: str) -> str:
     return number.replace(".dev", "~dev")
 
 
-def packages_of_tests(where: Path, system: str) -> Path:
+def packages_of_tests(where: Path, system: str, machine: str) -> Path:
     """Return a directory with what the tests import besides acsard, without numpy."""
-    place = where / f"test-packages-{system}"
+    place = where / f"test-packages-{system}-{machine}"
     if not place.exists():
         project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
         extras = project["optional-dependencies"]
@@ -121,6 +123,9 @@ def packages_of_tests(where: Path, system: str) -> Path:
         wanted = [name for name in extras["test"] if not name.startswith(unneeded)]
         words = [sys.executable, "-m", "pip", "install", "--quiet", "--target", str(place)]
         words += ["--only-binary", ":all:", "--python-version", PYTHONS[system]]
+        for glibc in range(17, 37):  # Debian 12 has 2.36
+            words += ["--platform", f"manylinux_2_{glibc}_{MACHINES[machine]}"]
+        words += ["--platform", f"manylinux2014_{MACHINES[machine]}"]
         # The package leaves these out, but a copy of an environment has them.
         _run(*words, *wanted, *extras["foxglove"], "markdown-it-py", "pygments")
         # The tests run on the system's numpy.
@@ -132,8 +137,8 @@ def packages_of_tests(where: Path, system: str) -> Path:
 class Root:
     """A minimal system without Python, in a directory, with this machine's /proc, /sys and /dev."""
 
-    def __init__(self, path: Path, system: str) -> None:
-        self.path, self.system = path, system
+    def __init__(self, path: Path, system: str, machine: str) -> None:
+        self.path, self.system, self.machine = path, system, machine
 
     def words(self, *words: str) -> list[str]:
         """Return the words of a host command that runs `words` inside."""
@@ -190,7 +195,7 @@ def root(where: Path, system: str, machine: str) -> Iterator[Root]:
         _run("tar", "-xf", str(base), "-C", place)
         os.chmod(place, 0o755)
         shutil.copyfile("/etc/resolv.conf", Path(place, "etc/resolv.conf"))
-        yield Root(Path(place), system)
+        yield Root(Path(place), system, machine)
 
 
 def _run(*words: str) -> None:
