@@ -41,11 +41,14 @@ def names_of(page: str, text: str) -> Iterator[str]:
         if line.startswith("## ") and page != "codes":  # a code is one word everywhere
             section = f"{line.removeprefix('## ').strip('`')}/"
         elif line.startswith("| "):
-            first = re.sub(r"^\| `[A-Z]+` \| ", "", line).split(" | ")[0]  # no method of HTTP
+            first, second, *_ = re.sub(r"^\| `[A-Z]+` \| ", "", line).split(" | ") + [""]
             for code in re.findall(r"`([^`]+)`|<code>(.+?)</code>", first):
                 # An argument's value and a method's arguments are not a part of its name.
                 name = re.split("[ (=]", "".join(code))[0].replace("\\|", "|")
                 yield f"{page}/{section}{unescape(name)}"
+                if page == "messages":  # the values of a field that has no others
+                    for value in re.findall(r"`([^`]+)`", second):
+                        yield f"{page}/{section}{name}/{value}"
 
 
 def file_of_release() -> str:
