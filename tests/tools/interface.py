@@ -41,7 +41,7 @@ def names_of(page: str, text: str) -> Iterator[str]:
         if line.startswith("## ") and page != "codes":  # a code is one word everywhere
             section = f"{line.removeprefix('## ').strip('`')}/"
         elif line.startswith("| "):
-            first, second, *_ = re.sub(r"^\| `[A-Z]+` \| ", "", line).split(" | ") + [""]
+            first, second, *_ = [*re.sub(r"^\| `[A-Z]+` \| ", "", line).split(" | "), ""]
             for code in re.findall(r"`([^`]+)`|<code>(.+?)</code>", first):
                 # An argument's value and a method's arguments are not a part of its name.
                 name = re.split("[ (=]", "".join(code))[0].replace("\\|", "|")
