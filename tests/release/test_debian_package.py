@@ -169,7 +169,12 @@ def test_it_takes_60_mb_and_every_module_imports(bare: Root) -> None:
     assert "sudo apt install python3-numpy" not in bare.run("acsard calibrate --help")
 
 
-@on_each
+@pytest.mark.parametrize(
+    "bare",
+    [*((system, "amd64") for system in SYSTEMS), ("deb12", "arm64")],
+    indirect=True,
+    ids="-".join,
+)
 def test_the_unit_tests_pass_on_the_installed_files(bare: Root, place: Path) -> None:
     bare.run(f"apt-get install --yes {deb(NUMBER)} git", within=3000.0)
     packages = packages_of_tests(place, bare.system, bare.machine)
