@@ -25,6 +25,7 @@ from tests.system.harness import (
     finish,
     until,
 )
+from tests.tools.interface import last_release
 
 OTHER = "001e0307640b812e62f0702b881cfcaf3abb01b7"  # 0.2.0, the release before
 
@@ -83,6 +84,11 @@ def running(pair: tuple[Version, Version]) -> Iterator[tuple[Daemon, Bus]]:
     with pair[0].daemon() as daemon, Bus(daemon.endpoint) as bus:
         bus.linked()
         yield daemon, bus
+
+
+def test_the_other_version_is_the_release_before_this_one(other: Path) -> None:
+    number = f'__version__ = "{last_release().stem}"'
+    assert number in (other / "acsard/__init__.py").read_text()
 
 
 CLIENT = """\

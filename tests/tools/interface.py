@@ -57,8 +57,13 @@ def file_of_release() -> str:
     return head + "".join(f"{name}\n" for name in sorted(names()))
 
 
+def last_release(before: str = __version__) -> Path:
+    """Return the file of the last release before a version."""
+    files = {order(path.stem): path for path in RELEASED.glob("*.txt")}
+    return files[max(number for number in files if number < order(before))]
+
+
 def released(before: str = __version__) -> set[str]:
     """Return the names of the last release before a version."""
-    files = {order(path.stem): path for path in RELEASED.glob("*.txt")}
-    last = files[max(number for number in files if number < order(before))]
-    return {line for line in last.read_text().splitlines() if not line.startswith("#")}
+    lines = last_release(before).read_text().splitlines()
+    return {line for line in lines if not line.startswith("#")}
