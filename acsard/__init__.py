@@ -73,4 +73,4 @@ Three invariants hold, and each is tested:
    that line, and the next line replaces it.
 """
 
-__version__ = "0.2.0"
+__version__ = "0.3.0"

@@ -66,6 +66,8 @@ LIVE = ("bench", "firmware", "system", "systemd")
 VARIATIONS_PER_CI_TEST = 10
 """`.ci/run` runs about one in this many slow variations. The nightly job runs the others."""
 
+ANY_SPEED = "ACSARD_TEST_ANY_SPEED"  # set for the tests of installed files
+
 LONGEST = 200
 """Processor time of this process in which a test without one of these marks must end.
 
@@ -216,12 +218,13 @@ def _loop_s() -> float:
 def pytest_runtest_call(item: pytest.Item) -> Generator[None, object, object]:
     """Fail a test without a mark that computes for too long.
 
-    Coverage, and the other profiles of hypothesis, may take longer.
+    Coverage, the other profiles of hypothesis, and a Python with other libraries may take longer.
     """
     began = time.process_time()
     result = yield
     took = time.process_time() - began
     usual = settings().max_examples <= 10 and "coverage" not in sys.modules
+    usual = usual and ANY_SPEED not in os.environ
     marked = MARKS & {mark.name for mark in item.iter_markers()}
     if took > 0.5 and usual and not marked and took / _loop_s() > LONGEST:
         pytest.fail(f"{took:.1f} s of processor time: make it smaller, or mark it `slow`")

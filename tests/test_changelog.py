@@ -1,4 +1,4 @@
-"""The changelog's sections are short, and the first one is of this version."""
+"""The changelog's sections are short, and it and the pages are of this version."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import re
 from pathlib import Path
 
 from acsard import __version__
+from tests.pages import PAGES, text_of
 
 CHANGELOG = Path(__file__).parent.parent / "CHANGELOG.md"
 
@@ -23,3 +24,10 @@ def test_each_section_says_on_two_screens_what_an_upgrade_asks() -> None:
     for section in SECTIONS:
         assert section.count("\n### What an upgrade asks of you\n") == 1
         assert section.count("\n") < 90
+
+
+def test_the_pages_name_the_files_of_this_version() -> None:
+    named = re.compile(r"\bacsard[ _-](\d+\.\d+\.\d+)")
+    found = {page: named.findall(text_of(page)) for page in PAGES if "/figures" not in page}
+    assert sum(map(bool, found.values())) >= 4
+    assert set().union(*found.values()) == {__version__.partition(".dev")[0]}

@@ -1,4 +1,4 @@
-"""The generated parts of the pages and of the deployment files follow the table of keys."""
+"""Generated files and parts of files follow their tables, and a release has its public names."""
 
 from __future__ import annotations
 
@@ -8,6 +8,8 @@ from tests.tools.tables import FILES, ROOT
 
 
 @pytest.mark.parametrize("name", FILES)
-def test_each_file_agrees_with_the_table_of_keys_and_roles(name: str) -> None:
+def test_each_file_is_what_its_tables_say(name: str) -> None:
+    """`python -m tests.tools.tables` writes the files again."""
+    assert (ROOT / name).exists(), "type python -m tests.tools.tables"
     text = (ROOT / name).read_text()
     assert FILES[name](text) == text, f"`python -m tests.tools.tables` writes {name} again"

@@ -12,26 +12,29 @@ import subprocess
 import sys
 import tempfile
 import tomllib
-import venv
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from hashlib import md5
 from pathlib import Path
 
+from acsard import __version__
+from acsard.host.version import DIRTY, full_version, source_of
 from tests.system.harness import ROOT
-
-RELEASE = ROOT / "deploy" / "release"
 
 SYSTEMS = {"deb12": "bookworm", "deb13": "trixie", "ubuntu24.04": "noble"}
 PYTHONS = {"deb12": "3.11", "deb13": "3.13", "ubuntu24.04": "3.12"}
+
+MACHINES = {"amd64": "x86_64", "arm64": "aarch64"}
 
 UBUNTU = (
     "deb [signed-by=/usr/share/keyrings/ubuntu-archive-keyring.gpg] "
     "http://archive.ubuntu.com/ubuntu noble main universe"
 )
 
-NUMBER, NEWER = "0.2.0.dev1", "0.2.0.dev2"
-"""The version of the packages, and that of copies which only have another version."""
+COMMIT = source_of(ROOT).removesuffix(DIRTY)
+
+NUMBER = full_version(__version__, COMMIT)  # of the packages
+NEWER = f"9{NUMBER[1:]}"  # of copies which only have another version
 
 BINFMT = Path("/proc/sys/fs/binfmt_misc")
 
@@ -59,40 +62,19 @@ def runs_arm64() -> bool:
     return entry.exists() and "F" in entry.read_text().split("flags:")[1].splitlines()[0]
 
 
-def packages(out: Path, tools: Path) -> list[Path]:
-    """Return the six packages of this clone in the directory `out`, with the version `NUMBER`.
+def packages(out: Path, commit: str = COMMIT) -> list[Path]:
+    """Return the packages of a commit, as its own release script makes them, in `out`.
 
-    If it does not exist, make them with a venv of the locked tools, in the directory `tools`.
+    If this directory is there, it has them.
     """
     if not out.exists():
-        python = str(tools / "bin" / "python")
-        if not tools.exists():
-            venv.create(tools, with_pip=True)
-            _run(python, "-m", "pip", "install", "-q", "-r", str(RELEASE / "requirements.lock"))
-        with tempfile.TemporaryDirectory() as work:
-            wheel = _wheel(python, Path(work))
-            made = Path(tempfile.mkdtemp(dir=out.parent))
-            _run(python, str(RELEASE / "debian.py"), str(wheel), str(made))
+        with tempfile.TemporaryDirectory(dir=out.parent) as work:
+            clone, made = Path(work, "clone"), Path(work, "made")
+            _run("git", "clone", "--quiet", str(ROOT), str(clone))
+            _run("git", "-C", str(clone), "checkout", "--quiet", commit)
+            _run(str(clone / "deploy/release/build"), "--out", str(made))
             made.rename(out)
     return sorted(out.glob("*.deb"))
-
-
-def _wheel(python: str, work: Path) -> Path:
-    # Of the files that git tracks, because others are not in a release. The tools add the manual.
-    git = ["git", "-c", "safe.directory=*", "ls-files", "-z", "--cached", "--others"]
-    listed = subprocess.run(
-        [*git, "--exclude-standard"], cwd=ROOT, capture_output=True, text=True, check=True
-    )
-    for name in filter(None, listed.stdout.split("\0")):
-        if (ROOT / name).is_file():
-            (work / name).parent.mkdir(parents=True, exist_ok=True)
-            shutil.copyfile(ROOT / name, work / name)
-    init = work / "acsard" / "__init__.py"
-    text, _, _ = init.read_text().rpartition("__version__")
-    init.write_text(f'{text}__version__ = "{NUMBER}"\n')
-    words = ("-m", "build", "--no-isolation", "--wheel", "--outdir", str(work), str(work))
-    _run(python, *words)
-    return next(work.glob("*.whl"))
 
 
 def package(made: Iterable[Path], system: str, machine: str) -> Path:
@@ -130,9 +112,9 @@ def debian_version(number: str) -> str:
     return number.replace(".dev", "~dev")
 
 
-def packages_of_tests(where: Path, system: str) -> Path:
+def packages_of_tests(where: Path, system: str, machine: str) -> Path:
     """Return a directory with what the tests import besides acsard, without numpy."""
-    place = where / f"test-packages-{system}"
+    place = where / f"test-packages-{system}-{machine}"
     if not place.exists():
         project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
         extras = project["optional-dependencies"]
@@ -141,6 +123,9 @@ def packages_of_tests(where: Path, system: str) -> Path:
         wanted = [name for name in extras["test"] if not name.startswith(unneeded)]
         words = [sys.executable, "-m", "pip", "install", "--quiet", "--target", str(place)]
         words += ["--only-binary", ":all:", "--python-version", PYTHONS[system]]
+        for glibc in range(17, 37):  # Debian 12 has 2.36
+            words += ["--platform", f"manylinux_2_{glibc}_{MACHINES[machine]}"]
+        words += ["--platform", f"manylinux2014_{MACHINES[machine]}"]
         # The package leaves these out, but a copy of an environment has them.
         _run(*words, *wanted, *extras["foxglove"], "markdown-it-py", "pygments")
         # The tests run on the system's numpy.
@@ -152,8 +137,8 @@ def packages_of_tests(where: Path, system: str) -> Path:
 class Root:
     """A minimal system without Python, in a directory, with this machine's /proc, /sys and /dev."""
 
-    def __init__(self, path: Path, system: str) -> None:
-        self.path, self.system = path, system
+    def __init__(self, path: Path, system: str, machine: str) -> None:
+        self.path, self.system, self.machine = path, system, machine
 
     def words(self, *words: str) -> list[str]:
         """Return the words of a host command that runs `words` inside."""
@@ -210,7 +195,7 @@ def root(where: Path, system: str, machine: str) -> Iterator[Root]:
         _run("tar", "-xf", str(base), "-C", place)
         os.chmod(place, 0o755)
         shutil.copyfile("/etc/resolv.conf", Path(place, "etc/resolv.conf"))
-        yield Root(Path(place), system)
+        yield Root(Path(place), system, machine)
 
 
 def _run(*words: str) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import shutil
 import socket
+import subprocess
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -12,7 +13,9 @@ from typing import Any
 
 import pytest
 
+from tests.conftest import ANY_SPEED
 from tests.release.debian_root import (
+    MACHINES,
     NEWER,
     NUMBER,
     SYSTEMS,
@@ -30,8 +33,9 @@ from tests.system.chromium import CHROMIUM, PHONE, Browser, browsing
 from tests.system.harness import ROOT, Program, until
 from tests.system.hosts import inside, ip, on
 from tests.system.terminals import Terminal
+from tests.system.test_versions import OTHER
 from tests.systemd.container import CONFIG, GATEWAY, PAGE, UNIT, Board, Container
-from tests.systemd.test_upgrade import Robot, commanded
+from tests.systemd.test_upgrade import BAD, Robot, commanded
 
 pytestmark = [
     pytest.mark.systemd,
@@ -40,7 +44,12 @@ pytestmark = [
     pytest.mark.skipif(bool(missing_programs()), reason=missing_programs()),
 ]
 
-MACHINES = ("amd64", "arm64")
+# All take hours on an emulated processor. These are the line, the guard, the drive, the bytes of
+# the messages, and recorded drives, which must replay to the bit.
+EMULATED = (
+    "tests/unit/test_link_line.py tests/unit/test_drive*.py tests/unit/test_messages_*.py "
+    "tests/test_recordings.py"
+)
 
 LIMIT_MB = 60
 
@@ -62,7 +71,7 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="session")
 def made(place: Path) -> list[Path]:
     """Provide the six packages."""
-    return packages(place / "packages", place / "tools")
+    return packages(place / "packages")
 
 
 @pytest.fixture
@@ -161,10 +170,15 @@ def test_it_takes_60_mb_and_every_module_imports(bare: Root) -> None:
     assert "sudo apt install python3-numpy" not in bare.run("acsard calibrate --help")
 
 
-@on_amd64
+@pytest.mark.parametrize(
+    "bare",
+    [*((system, "amd64") for system in SYSTEMS), ("deb12", "arm64")],
+    indirect=True,
+    ids="-".join,
+)
 def test_the_unit_tests_pass_on_the_installed_files(bare: Root, place: Path) -> None:
-    bare.run(f"apt-get install --yes {deb(NUMBER)} git")
-    packages = packages_of_tests(place, bare.system)
+    bare.run(f"apt-get install --yes {deb(NUMBER)} git", within=3000.0)
+    packages = packages_of_tests(place, bare.system, bare.machine)
     shutil.copytree(packages, bare.path / "packages")
     for name in ("tests", "deploy", "README.md", "pyproject.toml", "acsard.toml"):
         copy = shutil.copytree if (ROOT / name).is_dir() else shutil.copyfile
@@ -172,13 +186,14 @@ def test_the_unit_tests_pass_on_the_installed_files(bare: Root, place: Path) -> 
         copy(ROOT / name, bare.path / "clone" / name)
     # Some tests read the source.
     (bare.path / "clone/acsard").symlink_to("/opt/acsard/current/lib/acsard")
+    files = "tests/unit" if bare.machine == "amd64" else EMULATED
     left_out = " ".join(f"--deselect '{name}'" for name in OF_A_CLONE)
     told = bare.run(
         # Some tests list all processes, and others of this machine may use the same ptys.
-        "cd /clone && PYTHONPATH=/opt/acsard/current/lib:/packages "
+        f"cd /clone && {ANY_SPEED}=1 PYTHONPATH=/opt/acsard/current/lib:/packages "
         "unshare --pid --fork --mount-proc --propagation unchanged "
         "python3 -P -m pytest --import-mode=append -p no:cacheprovider -q -n 2 --timeout 600 "
-        f"tests/unit {left_out}",
+        f"{files} {left_out}",
         within=3000.0,
     )
     assert " passed" in told.splitlines()[-1]
@@ -215,32 +230,31 @@ def test_an_upgrade_switches_nothing_and_purge_leaves_nothing(bare: Root) -> Non
     assert bare.files() == before
 
 
-def test_the_same_source_gives_the_same_bytes(
-    made: list[Path], place: Path, tmp_path: Path
-) -> None:
-    again = packages(tmp_path / "again", place / "tools")
-    assert [path.name for path in made] == [path.name for path in again]
-    for one, other in zip(made, again, strict=True):
-        assert one.read_bytes() == other.read_bytes(), one.name
+@pytest.mark.skipif(shutil.which("lintian") is None, reason="no lintian")
+def test_lintian_finds_nothing_that_no_override_explains(made: list[Path]) -> None:
+    words = ["lintian", "--info", "--allow-root", *map(str, made)]
+    done = subprocess.run(words, capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stdout) == (0, "")
 
 
 MANUAL = ("python3", "-c", "import urllib.request as url; "
           "print(url.urlopen('http://127.0.0.1:8080/docs').read().decode())")  # fmt: skip
 
 
-def _two_packages(bare: Root, made: list[Path]) -> tuple[Path, Path]:
-    """Give a root systemd and two packages of different versions, the older first."""
+def _copied(bare: Root, *debs: Path) -> None:
+    """Give a root systemd and packages."""
     bare.run("apt-get install --yes --no-install-recommends systemd-sysv dbus udev python3")
-    first = package(made, "deb12", "amd64")
-    shutil.copyfile(first, bare.path / first.name)
-    return first, newer(first, bare.path)
+    for deb in debs:
+        shutil.copyfile(deb, bare.path / deb.name)
 
 
 def test_the_first_installation_starts_the_service_and_no_upgrade_restarts_it(
     made: list[Path], place: Path, tmp_path: Path
 ) -> None:
     with root(place, "deb12", "amd64") as bare:
-        first, second = _two_packages(bare, made)
+        first = package(made, "deb12", "amd64")
+        second = newer(first, bare.path)
+        _copied(bare, first)
         with Container(bare.path, tmp_path, "acsard-deb") as container:
             done = container.run("dpkg", "--install", f"/{first.name}")
             assert done.code == 0, done.err
@@ -281,39 +295,76 @@ def test_the_first_installation_starts_the_service_and_no_upgrade_restarts_it(
             assert [path for path in left.out.split() if not path.startswith("/srv/acsard")] == []
 
 
-def test_service_upgrade_changes_to_a_package_and_rollback_back_with_the_stop_latched(
-    made: list[Path], place: Path, tmp_path: Path
+AWAY, TLS = "https://robot.local:8443", "/etc/acsard/tls"
+
+
+@pytest.fixture(scope="session")
+def before(place: Path) -> list[Path]:
+    """Provide the packages of the release before this one."""
+    return packages(place / "before", OTHER)
+
+
+@pytest.mark.parametrize("system", ["deb12", "deb13"])
+def test_the_release_before_is_upgraded_and_back_and_goes_back_from_a_bad_version(
+    system: str, before: list[Path], made: list[Path], place: Path, tmp_path: Path
 ) -> None:
-    with root(place, "deb12", "amd64") as bare:
-        first, second = _two_packages(bare, made)
+    first, second = (package(debs, system, "amd64") for debs in (before, made))
+    old = first.name.removeprefix("acsard_").partition("-")[0]
+    with root(place, system, "amd64") as bare:
+        _copied(bare, first, second)
         with Container(bare.path, tmp_path, "acsard-deb") as container, Board(container) as board:
             done = container.run("dpkg", "--install", f"/{first.name}")
             assert done.code == 0, done.err
-            robot = Robot(container, board, NUMBER)
+            robot = Robot(container, board, old)
             until(robot.link, 60.0, "the link is up")
-            robot.stops()
+            for words in (
+                ("set", "limits.linear_speed", "0.4", "--keep", "--config", CONFIG),
+                ("tls", "init", "--directory", TLS, "--address", "robot.local"),
+                ("web", "--config", CONFIG, "--address", AWAY, "--tls", TLS, "invite", "viewer"),
+                ("call", "stop"),
+            ):
+                done = robot.types(*words)
+                assert done.code == 0, done
             number, kept, recordings = robot.latch(), robot.kept(), robot.recordings()
-            assert number != "0"
+            assert (number != "0", len(kept) > 1, len(recordings)) == (True, True, 1)
             pid, began = container.main_pid(), time.monotonic()
 
-            for words, new, old in (
-                (("upgrade", f"/{second.name}"), NEWER, NUMBER),
-                (("rollback",), NUMBER, NEWER),
-            ):
-                change = commanded(robot, *words)
-                assert change.code == 0, change.out
-                assert (robot.readlink(), robot.readlink("previous"), robot.runs()) == (
-                    new, old, new,
-                )  # fmt: skip
-                assert container.main_pid() != pid
-                pid = container.main_pid()
+            def runs(new: str, previous: str) -> None:
+                links = (robot.readlink(), robot.readlink("previous"), robot.runs())
+                assert links == (new, previous, new)
                 info = robot.types("get", "info").out.replace(" ", "")
                 assert f'"version":"{new}"' in info
-                assert (robot.link(), robot.latch(), robot.kept()) == (True, number, kept)
+                assert (robot.link(), robot.latch()) == (True, number)
+                # The page writes the time into the file of its tokens.
+                changed = {name for name, _ in kept.items() - robot.kept().items()}
+                assert changed <= {"/var/lib/private/acsard-web/tokens.json"}
+                assert "viewer" in robot.types("web", "--config", CONFIG, "tokens").out
                 assert recordings <= robot.recordings()
                 # The unit in use is this version's own.
                 used = f"/opt/acsard/{new}/lib/acsard/deploy/systemd/{UNIT}"
                 container.types(f"cmp {used} /etc/systemd/system/{UNIT}", "/")
+
+            for how in ("crashes later", "has no link", "refuses the configuration"):
+                container.run("dpkg", "--install", f"/{second.name}")
+                Robot(container, board, NUMBER).makes("9.0.0", BAD[how])
+                change = commanded(robot, "upgrade", "/opt/acsard/9.0.0")
+                print(how, change.out, change.err, sep="\n")
+                assert change.code == 1
+                runs(old, "")
+
+            for change_words, new, previous in (
+                (("upgrade", f"/{second.name}"), NUMBER, old),
+                (("rollback",), old, NUMBER),
+                (("rollback",), NUMBER, old),
+            ):
+                change = commanded(robot, *change_words)
+                print(change.out, change.err)
+                assert change.code == 0, change.out
+                assert container.main_pid() != pid
+                pid = container.main_pid()
+                runs(new, previous)
             assert robot.moved(began) == []
-            status = robot.types("service", "status").out
-            assert f"version {NEWER} is installed, but not in use" in status
+            shown = robot.types("recording", "--directory", "/var/lib/acsard/record")
+            assert shown.out.count("\n") > len(recordings)
+            assert '"linear_speed":0.4' in robot.types("get", "config").out.replace(" ", "")
+            assert robot.types("call", "clear").code == 0

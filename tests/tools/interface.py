@@ -1,16 +1,18 @@
-"""`python -m tests.tools.interface`: write down the public names of the version that is released.
+"""The public names of this tree and of each release, which `tests/test_interface.py` compares.
 
-Only the steps of a release run it, as `deploy/release/README.md` says. The names are those of the
-reference in the manual. `tests/test_interface.py` compares them with the names of the last release.
+The names are those of the reference in the manual. `python -m tests.tools.tables` writes those of
+a release, a number without `.dev`, into a file of that number, which no later tree changes.
 """
 
 from __future__ import annotations
 
 import re
 from collections.abc import Iterator
+from html import unescape
 from pathlib import Path
 
 from acsard import __version__
+from acsard.host.version import order
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -22,7 +24,7 @@ PUBLIC = (
 )  # fmt: skip
 """The pages whose tables are the public interface."""
 
-RELEASED = ROOT / "tests/vectors/interface.txt"
+RELEASED = ROOT / "tests/vectors/interface"
 
 
 def names() -> set[str]:
@@ -39,19 +41,29 @@ def names_of(page: str, text: str) -> Iterator[str]:
         if line.startswith("## ") and page != "codes":  # a code is one word everywhere
             section = f"{line.removeprefix('## ').strip('`')}/"
         elif line.startswith("| "):
-            first = re.sub(r"^\| `[A-Z]+` \| ", "", line).split(" | ")[0]  # no method of HTTP
+            first, second, *_ = [*re.sub(r"^\| `[A-Z]+` \| ", "", line).split(" | "), ""]
             for code in re.findall(r"`([^`]+)`|<code>(.+?)</code>", first):
                 # An argument's value and a method's arguments are not a part of its name.
-                yield f"{page}/{section}{re.split('[ (=]', ''.join(code))[0]}"
+                name = re.split("[ (=]", "".join(code))[0].replace("\\|", "|")
+                yield f"{page}/{section}{unescape(name)}"
+                if page == "messages":  # the values of a field that has no others
+                    for value in re.findall(r"`([^`]+)`", second):
+                        yield f"{page}/{section}{name}/{value}"
 
 
-def released() -> set[str]:
-    """Return the names of the last release. Before the first one there is no such file."""
-    lines = RELEASED.read_text().splitlines()
+def file_of_release() -> str:
+    """Return the text of the file of this version."""
+    head = f"# The public names of {__version__}, written by python -m tests.tools.tables.\n"
+    return head + "".join(f"{name}\n" for name in sorted(names()))
+
+
+def last_release(before: str = __version__) -> Path:
+    """Return the file of the last release before a version."""
+    files = {order(path.stem): path for path in RELEASED.glob("*.txt")}
+    return files[max(number for number in files if number < order(before))]
+
+
+def released(before: str = __version__) -> set[str]:
+    """Return the names of the last release before a version."""
+    lines = last_release(before).read_text().splitlines()
     return {line for line in lines if not line.startswith("#")}
-
-
-if __name__ == "__main__":
-    number = __version__.partition(".dev")[0]
-    head = f"# The public names of {number}, written by python -m tests.tools.interface.\n"
-    RELEASED.write_text(head + "".join(f"{name}\n" for name in sorted(names())))

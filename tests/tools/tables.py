@@ -1,4 +1,5 @@
-"""Writes the generated pages, and parts of others, of the router's and of the bridge's file.
+"""Writes the generated pages, and parts of others, of the router's and of the bridge's file. In a
+release it also writes the public names.
 
 `python -m tests.tools.tables` writes them, and `tests/test_tables.py` compares them.
 """
@@ -9,6 +10,7 @@ import re
 from collections.abc import Callable
 from pathlib import Path
 
+from acsard import __version__
 from acsard.core.config.settings import Config
 from acsard.core.messages.keys_and_roles import (
     PUBLISHED,
@@ -28,6 +30,7 @@ from acsard.core.messages.permissions import (
 from acsard.core.ros.transports import ros_names
 from acsard.core.values import ROLES, Role
 from acsard.machine.router_file import EXAMPLE_ROBOT
+from tests.tools.interface import file_of_release
 from tests.tools.reference import GENERATED, ros, table
 
 ROOT = Path(__file__).parents[2]
@@ -154,6 +157,8 @@ FILES: dict[str, Callable[[str], str]] = {
     "deploy/zenoh/router.json5": router_file,
     **{name: _whole(write) for name, write in GENERATED.items()},
 }
+if ".dev" not in __version__:
+    FILES[f"tests/vectors/interface/{__version__}.txt"] = _whole(file_of_release)
 """Maps each file to the function that writes its generated parts again."""
 
 

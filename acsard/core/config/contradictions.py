@@ -47,6 +47,8 @@ MOST_ASKED_HZ = 111
 
 MIN_RATE_HZ = 0.1  # publishing, if not 0
 
+STDS = ("wheel_separation_multiplier_std", "wheel_radius_ratio_std", "distance_scale_std")
+
 LARGEST_M = {"wheel_radius": 0.5, "wheel_separation": 3.0}  # more was measured in cm
 
 MAX_VOLTS = 99.99  # in a status line
@@ -78,6 +80,11 @@ def warnings(config: Config) -> list[str]:
                 f"drive.{key} = {metres:g}: the unit is metres; if you measured {metres:g} cm, "
                 f"write {metres / 100:g}"
             )
+    if exact := [f"odometry.{key} = 0" for key in STDS if getattr(config.odometry, key) == 0]:
+        messages.append(
+            f"{', '.join(exact)}: nobody measures without an error, so the pose is less certain "
+            "than it says; delete the line, or let `acsard calibrate` write what it measures"
+        )
     needed = limits.linear_speed / drive.wheel_radius
     if needed > limits.wheel_speed:
         messages.append(
