@@ -5,10 +5,16 @@ The cases are those of `pose_faults.py`; `-m soak -s` runs all of them.
 
 from __future__ import annotations
 
-import pytest
+from functools import partial
 
-from tests.scenarios.pose_faults import Case, cases, run
-from tests.wheels import TWO
+import pytest
+from msgspec.structs import replace
+
+from acsard.core.config.settings import Config, McuConfig, SimConfig, WheelMap
+from tests.scenarios.pose_faults import Case, cases, judged, run
+from tests.scenarios.pose_nees import CALIBRATED
+from tests.scenarios.world import World
+from tests.wheels import TWO, four_and_two
 
 SOME = [
     Case("runaway motor", "rear_left", "to and fro"), Case("dead encoder", "left", "stop and go"),
@@ -32,6 +38,35 @@ def check(case: Case) -> None:
 @pytest.mark.parametrize("case", SOME, ids=lambda case: case.name)
 def test_a_wheel_fault_never_makes_a_wrong_pose_certain(case: Case) -> None:
     check(case)
+
+
+@pytest.mark.parametrize("seconds", [0.15, 0.6])
+@four_and_two
+def test_a_silence_hides_no_difference_behind_it(seconds: float, wheels: WheelMap) -> None:
+    world = World(Config(mcu=McuConfig(wheels=wheels)))
+    world.run(1.5)
+    world.drive(0.4, seconds=1.0)
+    world.stall(seconds)
+    with world.mcu.switched(partial(replace, gains=(0.5,) * len(world.mcu.switches.gains))):
+        world.drive(0.4, seconds=12.0)
+    assert world.state.pose_doubt == "wheels_and_commands_differ"
+
+
+@four_and_two
+def test_what_a_silence_hid_is_in_doubt_until_the_robot_drives_on(wheels: WheelMap) -> None:
+    world = World(Config(mcu=McuConfig(wheels=wheels, encoder_counts=3200, link_check="on"),
+                         odometry=CALIBRATED, sim=SimConfig(encoder_counts=3200)))  # fmt: skip
+    world.run(1.5)
+    world.drive(0.4, seconds=1.5)
+    deviations = [judged(world)[2][0]]
+    world.stall(0.6)
+    for speed in (0.0, 0.0, 0.4):
+        world.drive(speed, seconds=2.0)
+        deviations.append(judged(world)[2][0])
+    before, stopped, still, behind = deviations
+    assert stopped > 0.1 > 5 * before
+    assert still == pytest.approx(stopped, abs=1e-3)
+    assert behind < 0.05
 
 
 @pytest.mark.soak

@@ -123,7 +123,7 @@ class Trail(Struct):
         self.restart(speed)
         return most
 
-    def take(self, lag: Seconds, count: Rad, *, said: bool) -> Rad:
+    def take(self, lag: Seconds, count: Rad, *, said: bool = True) -> Rad:
         """End the step, and return what is in doubt now, as one standard deviation.
 
         Of a silence, nothing is `said`: the wheels may have obeyed another command in it.
