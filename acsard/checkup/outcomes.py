@@ -88,7 +88,7 @@ PASS? reply rate: right | {rate:.0f} Hz, {way}
     longest gap {longest:.0f} ms
 WARN? reply rate: lossy | {rate:.0f} Hz, {way}
     only {answered:.0%} of the lines were answered
-    -> odometry is computed only at this rate; a later step of this check counts lost lines
+    -> mend what the row `lost lines` of this check names: odometry has only the lines that arrive
 FAIL? reply rate: slow | {rate:.0f} Hz, {way}
     one reply every {gap:.0f} ms, but the daemon takes {quiet:.0f} ms of silence for a lost link
     -> write mcu.reply_period = {period:g}, or let the firmware answer every line
@@ -417,7 +417,7 @@ FAIL stop: turns | turns {seconds:g} s after zeros
     speed
 FAIL restarts: seen | {times}
     the board restarted {events}
-    -> is the supply weak (brown-out when motors start, a USB hub)? Use a separate supply for the
+    -> is the supply weak (a USB hub, a battery that sags)? Use a separate supply for the
     board, thicker leads, a common ground. Does a second program open the port (DTR resets many
     boards)?
     Otherwise its own watchdog or a crash of its firmware restarts it

@@ -97,7 +97,7 @@ FAIL received_statuses | only status lines
 FAIL received_text | text instead of replies
     no link to the microcontroller: {received}
     -> is mcu.port the port of the board (`acsard ports`)? Then its firmware prints other text:
-    remove its Serial.print or debug output, and let it answer each line with a reply such as
+    remove its debug output, and let it answer each line with a reply such as
     `ap00.00,bp00.00,cp00.00,dp00.00`, with the letters of mcu.wheels
 FAIL received_form | replies in another form
     no link to the microcontroller: {received}
