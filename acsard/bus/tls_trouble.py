@@ -66,10 +66,10 @@ def trouble(endpoint: str, directory: str) -> Reason | None:
             return reason("tls_no_route", host=host, reason=error.strerror)
         return reason("tls_no_program", host=host, port=port, reason=error)
     with plain:
-        return _tls_trouble(plain, host, directory)
+        return _tls_trouble(plain, host, port, directory)
 
 
-def _tls_trouble(plain: socket.socket, host: str, directory: str) -> Reason | None:
+def _tls_trouble(plain: socket.socket, host: str, port: str, directory: str) -> Reason | None:
     import ssl
 
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
@@ -90,16 +90,19 @@ def _tls_trouble(plain: socket.socket, host: str, directory: str) -> Reason | No
             link.recv(1)
     except ssl.SSLCertVerificationError as error:
         return _server_certificate_error(error.verify_code, error.verify_message, host, directory)
-    except ssl.SSLEOFError:
-        return reason("tls_closed", host=host)
+    except (ssl.SSLEOFError, ssl.SSLSyscallError, ssl.SSLZeroReturnError):
+        return reason("tls_closed", host=host, port=port)
     except ssl.SSLError as error:
-        return _client_certificate_error(error.reason or str(error), host, directory)
+        why = error.reason or str(error)
+        if "_ALERT_" not in why:
+            return reason("tls_not_spoken", host=host, port=port, reason=why)
+        return _client_certificate_error(why, host, directory)
     except TimeoutError:
         # If the handshake is over, the server waits for data: both ends have accepted the
         # certificates.
-        return None if shaken else reason("tls_handshake_hangs", host=host)
+        return None if shaken else reason("tls_handshake_hangs", host=host, port=port)
     except OSError:
-        return reason("tls_closed", host=host)
+        return reason("tls_closed", host=host, port=port)
     return None
 
 
@@ -135,6 +138,4 @@ def _client_certificate_error(why: str, host: str, directory: str) -> Reason:
     certificate = f"{directory}/{CERTIFICATE}"
     if why == "SSLV3_ALERT_CERTIFICATE_EXPIRED":
         return reason("tls_own_expired", host=host, certificate=certificate, renew=RENEW_ADVICE)
-    if "_ALERT_" in why:
-        return reason("tls_own_refused", host=host, certificate=certificate, reason=why)
-    return reason("tls_not_spoken", host=host, reason=why)
+    return reason("tls_own_refused", host=host, certificate=certificate, reason=why)

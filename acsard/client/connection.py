@@ -273,7 +273,7 @@ class Connection(Reads):
         _end([self])
 
     def call(self, service: str, **fields: object) -> schema.ServiceReply:
-        """Call a service, such as "stop", and return its reply, as `Client.call` does."""
+        """Call a service, such as "stop", and return its reply, also a refusal."""
         if service in ("clear", "activate") and "numbers" not in fields:
             fields["numbers"] = self._present_causes()
         reply = self.request(service, fields)
@@ -293,7 +293,7 @@ class Connection(Reads):
         ]
 
     def set(self, settings: Mapping[str, Plain]) -> schema.ServiceReply:
-        """Change settings of the daemon, as `Client.set` does."""
+        """Change settings of the daemon, and return its reply, also a refusal."""
         return self.request("set", {"settings": settings})
 
     def _offered(self) -> dict[str, list[str]]:

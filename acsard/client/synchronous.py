@@ -118,11 +118,11 @@ class Client(Reads):
             driver.end()
 
     def stop(self) -> ServiceReply:
-        """Stop the robot, and return its reply. It stays stopped until `clear`."""
+        """Stop the robot until `clear`, and return its reply. Raises `ReplyError`."""
         return self.call("stop")
 
     def clear(self) -> ServiceReply:
-        """Release the faults and stops that are older than this call, and return the reply."""
+        """Release the faults and stops from before this call. Raises `ReplyError`."""
         return self.call("clear")
 
     def call(self, service: str, **fields: object) -> ServiceReply:

@@ -20,7 +20,7 @@ from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
 from acsard.bus.tls_files import CA, CERTIFICATE, KEY
 from acsard.host.atomic_file import replace
-from acsard.host.errors import MendableError
+from acsard.host.errors import MendableError, NotPermittedError
 from acsard.machine.certificates import CA_KEY
 
 # An authority may sign for these, and for all names below them.
@@ -219,12 +219,13 @@ def _key_pem(key: ec.EllipticCurvePrivateKey) -> bytes:
 
 
 def _write(files: Mapping[Path, tuple[bytes, int]]) -> None:
-    # Never with more permissions than the mode. Raises `MendableError`.
+    # Never with more permissions than the mode. Raises `MendableError` or `NotPermittedError`.
     try:
         for path, (data, mode) in files.items():
             replace(path, data, mode=mode, owner=(os.geteuid(), os.getegid()))
     except OSError as error:
-        raise MendableError(
+        kind = NotPermittedError if isinstance(error, PermissionError) else MendableError
+        raise kind(
             f"cannot write {path}: {error.strerror}; the key and its certificate belong together, "
             "so remove the cause and run the command again"
         ) from None

@@ -64,7 +64,7 @@ MOST = 6
 
 VARYING = (
     (r"\S+@[^\s/]+( [^\s/]+)?/[0-9a-f]{16}", "SENDER"),
-    (r"0\.2\.0\S*(?=,? robot)", "VERSION"),
+    (r"\d+\.\d+\.\d+\S*?(?=,? robot)", "VERSION"),
     (r"/dev/pts/\d+", "PTY"),
     (r"\d{4}-\d\d-\d\d [\d:]+ UTC", "TIME"),
     (r"\(\d{9,}\)", "(NUMBER)"),

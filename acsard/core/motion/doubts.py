@@ -18,6 +18,7 @@ from typing import NamedTuple
 
 from msgspec import Struct, field
 
+from acsard.core.link.link_state import BOARD_STOPS_S
 from acsard.core.motion.gaps import AT_REST, plus
 from acsard.core.motion.obedience import AGREEMENT
 from acsard.core.motion.sides import SideName, lagged
@@ -34,7 +35,6 @@ NOISE_COUNTS = 1.5  # of an angle
 SHARE, DELAY_S, COUNTS = 0.05, 1.0, 2.0
 MEMORY_S = 30.0  # of driving
 
-BOARD_STOPS_S = 0.25  # without a line, a board may have stopped its motors
 NEAR_S = 1.0  # of driving, around a silence
 # As much as a silence hid must roll behind it to confirm it, or this share if another one comes.
 LEAST = 0.25
@@ -49,6 +49,7 @@ class Silences(Struct):
     most: Rad = 0.0  # what silences missed at most that no line has confirmed
     shown: Rad = 0.0  # in them
     behind: Rad = 0.0  # due or shown since the first of them
+    disagrees: bool = False  # in the last step: a delay of the motor is over by then
 
     def hide(self, due: Rad, shown: Rad) -> Rad:
         """Add a silence in which `due`, less or nothing was due; return the most it missed."""
@@ -57,17 +58,19 @@ class Silences(Struct):
         self.most, self.shown = self.most + most, self.shown + shown
         return math.copysign(most, due or shown)
 
-    def compare(self, due: Rad, shown: Rad, s: Seconds) -> None:
+    def compare(self, due: Rad, shown: Rad, s: Seconds, *, disagrees: bool) -> None:
         """Add a step of lines."""
         rolled, ahead = max(abs(due), abs(shown)), math.copysign(1.0, due or shown)
         keep = 1.0 / (1.0 + s / NEAR_S) if rolled else 1.0
         self.rolled = keep * self.rolled + rolled
         self.short = keep * self.short + ahead * (due - shown)
         self.behind += rolled
+        self.disagrees = disagrees
 
     def lies(self, count: Rad) -> bool:
-        """Return whether the lines contradict the commands, or none shows anything."""
-        return abs(self.short) > AGREEMENT * self.rolled + NOISE_COUNTS * count or not self.rolled
+        """Return whether the lines contradict the commands."""
+        most = AGREEMENT * self.rolled + NOISE_COUNTS * count
+        return self.disagrees and abs(self.short) > most
 
     def missed(self) -> Rad:
         """End the silences, and return what they missed if the side is as wrong as in the lines.
@@ -132,7 +135,7 @@ class Trail(Struct):
         if not said:
             self.due = self.shown = self.seconds = 0.0
             return more
-        self.silences.compare(self.due, self.shown, self.seconds)
+        self.silences.compare(self.due, self.shown, self.seconds, disagrees=disagrees)
         keep = 1.0 / (1.0 + self.seconds / MEMORY_S) if size or self.shown else 1.0
         self.recent, self.fastest = keep * self.recent + size, keep * self.fastest
         self.short = keep * self.short + more
@@ -226,9 +229,9 @@ class Doubts(Struct):
                 if not self.stopped:
                     missed[n] = trail.take(lag, count, said=not self.silent)
                 silences = trail.silences
-                lies, enough = silences.lies(count), LEAST if self.stopped else 1.0
-                if silences.most and (lies or silences.behind >= enough * silences.most):
-                    settled.append((side.name, lies))
+                enough = (LEAST if self.stopped else 1.0) * silences.most
+                if silences.most and silences.behind >= enough:
+                    settled.append((side.name, lies := silences.lies(count)))
                     if lies:
                         silences.restart()
                     else:

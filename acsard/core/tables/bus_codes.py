@@ -88,10 +88,10 @@ FAIL tls_no_program
     -> if a router should: is it running? If a robot should: does bus.listen in its acsard.toml
     contain this address?
 FAIL tls_handshake_hangs
-    {host} accepts the connection, but does not answer the TLS handshake:
+    {host} accepts the connection to port {port}, but does not answer the TLS handshake:
     -> restart it
 FAIL tls_closed
-    {host} closes the connection immediately:
+    {host} closes the connection to port {port} immediately:
     -> does a TLS endpoint of acsard listen there?
 FAIL tls_server_expired
     the certificate of {host} has expired, according to this machine's clock ({now})
@@ -118,7 +118,7 @@ FAIL tls_own_refused
     not sign it
     -> get one that `acsard tls add` made for this robot
 FAIL tls_not_spoken
-    {host} does not speak TLS on this port ({reason})
+    {host} does not speak TLS on port {port} ({reason})
     -> an endpoint without TLS begins with tcp/
 """,
 )

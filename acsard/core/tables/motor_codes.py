@@ -31,7 +31,7 @@ MOTORS = table(
 FAIL driver_fault
     the board reports a fault of a motor driver
     -> let the driver cool, and check its supply, and its motor for a short circuit or a blocked
-    wheel; then switch the robot off and on, and type `acsard call clear`
+    wheel; then switch the robot off and on
 FAIL impossible_speeds
     the board reports impossible speeds ({cause})
     -> check the encoder of this wheel, its leads, and the counts per turn in the firmware; if the
