@@ -21,7 +21,7 @@ from acsard.core.config.settings import Config, LimitsConfig
 from acsard.core.link.feedback import Line
 from acsard.core.link.link_output import QUESTION_LINE
 from acsard.core.link.link_setup import LinkSetup
-from acsard.core.link.link_state import BOARD_STOPS_S
+from acsard.core.link.link_state import WATCHDOG_S
 from acsard.core.motion.arbiter_text import missed, refused, waiting
 from acsard.core.motion.battery import empty_reason
 from acsard.core.motion.emergency_stop import DRIVER_FAULT_REASON, PRESSED_REASON
@@ -61,6 +61,10 @@ from acsard.core.values import (
 # Largest time step of the limiter, s, but at least 1.5 control periods. After a longer stall the
 # speed does not jump.
 MAX_DT = 0.05
+
+# After this time without a line, the next acceleration starts from rest, because the board may have
+# stopped the motors. The margin is for a board whose clock is slightly fast.
+WRITE_PAUSE_S = WATCHDOG_S - 0.05
 
 HALTED = (Mode.STOPPED, Mode.FAULT, Mode.SHUTDOWN)  # modes with the stop deceleration
 
@@ -235,7 +239,7 @@ class Robot:
         draft.made_of, draft.made_ns = (state.choice.twist, mode), now_ns
         since = (now_ns - out.made_ns) / NS_PER_S
         pressed = out.made_ns < draft.pressed_ns
-        if pressed or state.session.link != "up" or since > BOARD_STOPS_S:
+        if pressed or state.session.link != "up" or since > WRITE_PAUSE_S:
             # The first written line after a press contains zeros, even if the input is already
             # released and the commands that arrived meanwhile may move the robot.
             motion, speeds = AT_REST, STILL
@@ -436,7 +440,7 @@ class Robot:
         # Nobody knows which commands the board got in a silence, or while this computer was late.
         passed = line.dt + line.gap
         silent = passed > self.link_setup.covered_s
-        late = silent or state.session.steps.step_s > BOARD_STOPS_S
+        late = silent or state.session.steps.step_s > WRITE_PAUSE_S
         wheels.unseen = passed if late else 0.0
         doubts = state.odometry.doubts
         doubted = doubts.differs

@@ -1,6 +1,7 @@
 """A sweep over faults of wheels: how wrong and how certain the pose is, from the fault on.
 
-`python -m tests.scenarios.pose_faults [NAME]` prints each case whose NEES exceeds 6, unsaid.
+`python -m tests.scenarios.pose_faults [NAME]` prints each case whose NEES exceeds 6, unsaid. Those
+with silences of 0.6 s are only printed: on a checked link, 41 of 224 with stalls are beyond 6.
 """
 
 from __future__ import annotations
@@ -97,12 +98,11 @@ def cases() -> Iterator[Case]:
                 groups = [one, "left", "all"] if len(names) == 4 else [one, "all"]
             for which in groups:
                 yield Case(fault, which, drive, wheels, gyro)
-    silences = product(MAPS, DRIVES, ENCODERS, (0.15, 0.3, 0.6), (False, True), (False, True))
+    silences = product(MAPS, DRIVES, ENCODERS, (0.3, 0.6), (False, True), (False, True))
     for wheels, drive, fault, silence, mute, checked in silences:
         for which in ("left", "all"):
             yield Case(
                 fault, which, drive, wheels, checked=checked, silence=silence, mute=mute,
-                counts=3200 if silence > 0.2 else 48,
             )  # fmt: skip
 
 

@@ -11,7 +11,6 @@ from msgspec.structs import replace
 
 from acsard.core.config.settings import WheelMap
 from acsard.core.motion.gyro import Turn
-from acsard.core.motion.uncertainty import Path, Uncertainty
 from acsard.core.values import Pose, PoseCovariance, WheelSpeeds
 from tests.each import each
 from tests.unit.nees import PERIOD, RADIUS, TRACK
@@ -303,31 +302,3 @@ def test_a_pose_integrated_from_twists_is_as_uncertain_as_the_odometry() -> None
         yaw += estimate.twist_variances.angular * PERIOD**2
     assert along == pytest.approx(estimate.covariance.xx, rel=0.1)
     assert yaw == pytest.approx(estimate.covariance.yawyaw, rel=0.1)
-
-
-def behind_silences(metres: int, *, silences: bool, lies: bool = False) -> PoseCovariance:
-    """Return the covariance after a straight drive, with a silence settled in each metre or not."""
-    model = Odometer(replace(MEASURED, wheel_radius_ratio_std=0.002)).model
-    uncertainty, x = Uncertainty.initial(model, Pose()), 0.0
-    for step in range(20 * metres):
-        if silences and step % 20 == 10:
-            uncertainty.miss("silent left", 0.3, -2.0, 0.0)
-            uncertainty.miss("silent right", 0.3, 2.0, 0.0)
-        x += 0.05
-        uncertainty.seconds = 0.05
-        uncertainty.update(model, Pose(x), Path(x, 0.0, 0.0, step + 1), slips=False, by_gyro=False)
-        if silences and step % 20 == 19:
-            uncertainty.settle("silent left", "left" if lies else None)
-            uncertainty.settle("silent right", "right" if lies else None)
-    return uncertainty.covariance
-
-
-def test_a_silence_that_hid_nothing_makes_the_pose_neither_surer_nor_less_sure() -> None:
-    with_silences, without = behind_silences(60, silences=True), behind_silences(60, silences=False)
-    assert matrix(with_silences) == pytest.approx(matrix(without), rel=0.02, abs=1e-9)
-
-
-def test_a_silence_that_hid_a_lie_stays_in_doubt() -> None:
-    lied = behind_silences(1, silences=True, lies=True)
-    assert lied.yawyaw > 8.0
-    assert min(np.linalg.eigvalsh(matrix(lied))) > 0.0

@@ -42,10 +42,6 @@ WATCHDOG_S = 0.3  # without a valid line, the board stops the motors
 
 WATCHDOG_NS = int(WATCHDOG_S * NS_PER_S)
 
-# After this time without a line, the board may have stopped the motors: the next acceleration
-# starts from rest. The margin is for a board whose clock is slightly fast.
-BOARD_STOPS_S = WATCHDOG_S - 0.05
-
 # In a row, for a link. A board may print anything after a reset, but a checksum proves a line.
 GOOD_LINES, CHECKED_LINES = 3, 1
 

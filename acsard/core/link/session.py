@@ -148,7 +148,7 @@ class McuSession(Struct):
             ):
                 # The board may have had nothing to answer. Before its watchdog has stopped the
                 # motors, a stop without a ramp would only shake the robot. `Robot` makes such a
-                # stop anyway after `BOARD_STOPS_S`.
+                # stop anyway after `WRITE_PAUSE_S`.
                 link.wait(now_ns, setup.quiet_ns)
             if (
                 link.state == "up"

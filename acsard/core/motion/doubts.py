@@ -6,23 +6,19 @@ in the covariance, the deviation of the distance is the difference's share of th
 the motor, and a slope that the robot drives up and down, give it back. A large difference is said,
 too. Two wheels of a side that contradict each other are in doubt by half of their difference.
 
-In a long silence the board may have stopped, too. A wheel that shows the commanded motion may be
-wrong, and one that shows less may be right. All of that is in doubt until the lines behind the
-silence show whether the wheel obeys, and then it is as wrong as it is there.
+In a silence the board may have done something else than commanded, so its doubt is kept apart: the
+lines around it tell nothing of it, and what they show otherwise takes nothing of it back.
 """
 
 from __future__ import annotations
 
-import math
 from typing import NamedTuple
 
 from msgspec import Struct, field
 
-from acsard.core.link.link_state import BOARD_STOPS_S
 from acsard.core.motion.gaps import AT_REST, plus
 from acsard.core.motion.obedience import AGREEMENT
 from acsard.core.motion.sides import SideName, lagged
-from acsard.core.motion.uncertainty import Missed
 from acsard.core.motion.wheels import Wheels
 from acsard.core.values import Rad, RadPerS, Seconds, Wheels4
 
@@ -35,55 +31,6 @@ NOISE_COUNTS = 1.5  # of an angle
 SHARE, DELAY_S, COUNTS = 0.05, 1.0, 2.0
 MEMORY_S = 30.0  # of driving
 
-NEAR_S = 1.0  # of driving, around a silence
-# As much as a silence hid must roll behind it to confirm it, or this share if another one comes.
-LEAST = 0.25
-SILENT: dict[SideName, Missed] = {"left": "silent left", "right": "silent right"}
-
-
-class Silences(Struct):
-    """The motion of one side in long silences, until the lines behind show whether it obeys."""
-
-    rolled: Rad = 0.0  # due or shown, in about `NEAR_S` of lines
-    short: Rad = 0.0  # due minus shown in them, along the motion
-    most: Rad = 0.0  # what silences missed at most that no line has confirmed
-    shown: Rad = 0.0  # in them
-    behind: Rad = 0.0  # due or shown since the first of them
-    disagrees: bool = False  # in the last step: a delay of the motor is over by then
-
-    def hide(self, due: Rad, shown: Rad) -> Rad:
-        """Add a silence in which `due`, less or nothing was due; return the most it missed."""
-        most = max(abs(due - shown), abs(shown))
-        self.behind = self.behind if self.most else 0.0
-        self.most, self.shown = self.most + most, self.shown + shown
-        return math.copysign(most, due or shown)
-
-    def compare(self, due: Rad, shown: Rad, s: Seconds, *, disagrees: bool) -> None:
-        """Add a step of lines."""
-        rolled, ahead = max(abs(due), abs(shown)), math.copysign(1.0, due or shown)
-        keep = 1.0 / (1.0 + s / NEAR_S) if rolled else 1.0
-        self.rolled = keep * self.rolled + rolled
-        self.short = keep * self.short + ahead * (due - shown)
-        self.behind += rolled
-        self.disagrees = disagrees
-
-    def lies(self, count: Rad) -> bool:
-        """Return whether the lines contradict the commands."""
-        most = AGREEMENT * self.rolled + NOISE_COUNTS * count
-        return self.disagrees and abs(self.short) > most
-
-    def missed(self) -> Rad:
-        """End the silences, and return what they missed if the side is as wrong as in the lines.
-
-        About half of these came before the silences, when it may have obeyed.
-        """
-        missed = 2.0 * self.shown * self.short / self.rolled
-        self.restart()
-        return missed
-
-    def restart(self) -> None:
-        self.most, self.shown = 0.0, 0.0
-
 
 class Trail(Struct):
     """What one side shows otherwise than commanded, rad."""
@@ -93,7 +40,6 @@ class Trail(Struct):
     due: Rad = 0.0  # in the open step
     shown: Rad = 0.0
     seconds: Seconds = 0.0
-    silences: Silences = field(default_factory=Silences)
     recent: Rad = 0.0  # due in either direction, in `MEMORY_S`
     short: Rad = 0.0  # due minus shown, in `MEMORY_S`
     astray: Rad = 0.0  # the part of it in steps that differ by more than `AGREEMENT`
@@ -117,15 +63,6 @@ class Trail(Struct):
         size = max(abs(self.due), abs(self.shown))
         return self.disagrees(count) or size >= STEP_COUNTS * count or self.seconds >= STEP_S
 
-    def hide(self, speed: RadPerS) -> Rad:
-        """End a step with a long silence, behind which the side has this speed.
-
-        Return the most that the pose may have missed.
-        """
-        most = self.silences.hide(self.due, self.shown)
-        self.restart(speed)
-        return most
-
     def take(self, lag: Seconds, count: Rad, *, said: bool = True) -> Rad:
         """End the step, and return what is in doubt now, as one standard deviation.
 
@@ -135,7 +72,6 @@ class Trail(Struct):
         if not said:
             self.due = self.shown = self.seconds = 0.0
             return more
-        self.silences.compare(self.due, self.shown, self.seconds, disagrees=disagrees)
         keep = 1.0 / (1.0 + self.seconds / MEMORY_S) if size or self.shown else 1.0
         self.recent, self.fastest = keep * self.recent + size, keep * self.fastest
         self.short = keep * self.short + more
@@ -151,7 +87,6 @@ class Trail(Struct):
         self.expected, self.due, self.shown, self.seconds = speed, 0.0, 0.0, 0.0
 
     def forget(self) -> None:
-        self.silences.restart()
         self.astray = self.short = self.recent = 0.0
         self.weak = self.differs = False
 
@@ -160,8 +95,8 @@ class Found(NamedTuple):
     """Angles that the pose may have missed, rad."""
 
     astray: Wheels4  # of the sides
-    of_sides: list[tuple[Missed, Wheels4]]  # in silences, or its wheels contradict each other
-    settled: list[tuple[SideName, bool]]  # sides whose silences are in doubt for ever, or not
+    silent: bool  # a silence may be the cause
+    wheels: list[tuple[SideName, Wheels4]]  # of a side whose wheels contradict each other
 
 
 class Doubts(Struct):
@@ -175,7 +110,6 @@ class Doubts(Struct):
     seconds: Seconds = 0.0
     unknown: bool = False  # an emergency stop may have cut the power
     silent: bool = False  # a line ended a silence
-    stopped: bool = False  # the board may have stopped in it
 
     @property
     def differs(self) -> bool:
@@ -193,7 +127,6 @@ class Doubts(Struct):
             if wheels.unseen:
                 # Nobody knows which command the board obeyed in a silence.
                 self.silent = True
-                self.stopped |= wheels.unseen > BOARD_STOPS_S
                 now = max(before[0], now[0], key=abs), max(before[1], now[1], key=abs)
             self.commanded = left + now[0] * seconds, right + now[1] * seconds
         self.rolled, self.used = plus(self.rolled, rolled), plus(self.used, wheels.believed(rolled))
@@ -206,14 +139,13 @@ class Doubts(Struct):
     def update(self, wheels: Wheels, lag: Seconds, count: Rad) -> Found:
         """End the open lines, and return what is in doubt now."""
         s, rolled, used = self.seconds, self.rolled, self.used
-        astray, of_sides = AT_REST, list[tuple[Missed, Wheels4]]()
-        settled = list[tuple[SideName, bool]]()
+        astray, silent, wheels_astray = AT_REST, False, list[tuple[SideName, Wheels4]]()
         trails = (self.left, self.right)
         for trail, side, commanded in zip(trails, wheels.sides, self.commanded, strict=True):
             if s <= 0.0:
                 break
             angle = (used[side.front] + used[3 - side.front]) / 2
-            if all(wheels.wheels[i].rested for i in side.wheels) and not self.stopped:
+            if all(wheels.wheels[i].rested for i in side.wheels):
                 trail.restart(0.0)
             elif self.unknown:
                 trail.restart(angle / s)
@@ -221,30 +153,15 @@ class Doubts(Struct):
                 trail.follow(commanded / s, angle, s, lag)
             if side.out >= 0 or side.slip_s > 0.0:
                 half = (rolled[side.front] - rolled[side.rear]) / 2
-                of_sides.append((side.name, of_side(side.front, half)))
+                wheels_astray.append((side.name, of_side(side.front, half)))
         # One side alone would be in doubt of a turn.
         if self.left.ends(count) or self.right.ends(count):
-            speeds, missed = wheels.believed(wheels.speeds.as_tuple()), [0.0, 0.0]
-            for n, (trail, side) in enumerate(zip(trails, wheels.sides, strict=True)):
-                if not self.stopped:
-                    missed[n] = trail.take(lag, count, said=not self.silent)
-                silences = trail.silences
-                enough = (LEAST if self.stopped else 1.0) * silences.most
-                if silences.most and silences.behind >= enough:
-                    settled.append((side.name, lies := silences.lies(count)))
-                    if lies:
-                        silences.restart()
-                    else:
-                        missed[n] += silences.missed()
-                if self.stopped:
-                    speed = (speeds[side.front] + speeds[3 - side.front]) / 2
-                    of_sides.append((SILENT[side.name], of_side(side.front, trail.hide(speed))))
-            self.silent = self.stopped = False
-            left, right = missed
+            silent, self.silent = self.silent, False
+            left, right = (trail.take(lag, count, said=not silent) for trail in trails)
             astray = right, left, left, right
         self.commanded, self.seconds, self.unknown = (0.0, 0.0), 0.0, False
         self.rolled = self.used = AT_REST
-        return Found(astray, of_sides, settled)
+        return Found(astray, silent, wheels_astray)
 
     def forget(self) -> None:
         """Forget all doubts: the pose was set."""

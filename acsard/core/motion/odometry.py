@@ -17,13 +17,14 @@ from msgspec import Struct, field
 
 from acsard.core.link.feedback import MAX_FILLED_GAP_S, Line
 from acsard.core.motion.consistency import ConsistencyChecks
-from acsard.core.motion.doubts import SILENT, Doubts
+from acsard.core.motion.doubts import Doubts
 from acsard.core.motion.gaps import AT_REST, LONG_S, Rolled, Skipped, plus, rolled_over, times
 from acsard.core.motion.gyro import REST_S
 from acsard.core.motion.kinematics import on_arc
 from acsard.core.motion.uncertainty import (
     UPDATE_S,
     ErrorModel,
+    Missed,
     Path,
     Uncertainty,
     pushed,
@@ -43,6 +44,10 @@ from acsard.core.values import (
     Wheels4,
     WheelSpeeds,
 )
+
+# Columns of the doubts: the lines, and what a silence hid.
+USUAL: tuple[Missed, Missed] = ("way", "turn")
+SILENT: tuple[Missed, Missed] = ("silent way", "silent turn")
 
 
 class Odometry(Struct):
@@ -182,13 +187,12 @@ class Odometry(Struct):
             turns = 0.0 if turn is not None else 1.0
             if found.astray != AT_REST:
                 distance, angle = model.kinematics.moved(found.astray)
-                uncertainty.miss("way", distance, 0.0, heading)
-                uncertainty.miss("turn", 0.0, turns * angle, heading)
-            for side, lies in found.settled:
-                uncertainty.settle(SILENT[side], side if lies else None)
-            for cause, angles in found.of_sides:
+                of_way, of_turn = SILENT if found.silent else USUAL
+                uncertainty.miss(of_way, distance, 0.0, heading)
+                uncertainty.miss(of_turn, 0.0, turns * angle, heading)
+            for side, angles in found.wheels:
                 distance, angle = model.kinematics.moved(angles)
-                uncertainty.miss(cause, distance, turns * angle, heading)
+                uncertainty.miss(side, distance, turns * angle, heading)
         return Estimate(
             line.at, self.pose, self.twist, uncertainty.covariance, uncertainty.twist,
             self.positions, speeds, line.asked_ns, line.heard_ns,

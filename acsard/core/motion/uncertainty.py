@@ -70,12 +70,11 @@ NO_EFFECT: Effect = (0.0, 0.0, 0.0, 0.0)
 
 # Causes of an error that do not average out. The motion that the pose may have missed is that of
 # gaps, and the differences of gyro and wheels, of the wheels and their commands (`way` and `turn`),
-# of the wheels of a side, or of a side in silences, which may be taken back.
-Missed = Literal["gap", "gyro", "way", "turn", "left", "right", "silent left", "silent right"]
+# the same around silences, and of the wheels of a side.
+Missed = Literal["gap", "gyro", "way", "turn", "silent way", "silent turn", "left", "right"]
 RATIO, TRACK, SCALE, GYRO = PARAMETERS = range(4)
 MISSED: dict[Missed, int] = {cause: len(PARAMETERS) + i for i, cause in enumerate(get_args(Missed))}
 CAUSES = len(PARAMETERS) + len(MISSED)
-OPEN = MISSED["silent left"], MISSED["silent right"]
 
 
 class ErrorModel:
@@ -208,22 +207,6 @@ class Bend(Struct):
     )
     added: Vector = (0.0, 0.0, 0.0)  # to xx, xy and yy of the pose
 
-    def add_up(self) -> None:
-        """Add the sums up, of the causes that have columns."""
-        xx, xy, yy = self.noise
-        mean_x = mean_y = 0.0
-        bending = [k for k, column in enumerate(self.columns) if column != ORIGIN]
-        # With A_ik, these sums, and independent unit normals p, E[(p' A p)^2] is the square of the
-        # trace, plus the sums of A_ik^2 and of A_ik A_ki.
-        for k in bending:
-            for i in bending:
-                x, y = self.of_causes[CAUSES * i + k]
-                of_x, of_y = self.of_causes[CAUSES * k + i]
-                xx, xy, yy = xx + x * (x + of_x), xy + x * (y + of_y), yy + y * (y + of_y)
-                if i == k:
-                    mean_x, mean_y = mean_x + x, mean_y + y
-        self.added = xx + mean_x * mean_x, xy + mean_x * mean_y, yy + mean_y * mean_y
-
 
 class Uncertainty(Struct):
     """The uncertainty of pose and twist. `covariance` and `twist` are what is published."""
@@ -288,17 +271,11 @@ class Uncertainty(Struct):
         self.astray += abs(distance) * self._share_astray()
         self._publish()
 
-    def _heading_variance(self) -> float:
-        # Without what may be taken back: it must hide no error of the path.
-        kept = [yaw for k, (_, _, yaw) in enumerate(self.columns) if k not in OPEN]
-        return self.p.yawyaw + sum([yaw * yaw for yaw in kept])
-
     def _share_astray(self) -> float:
         # The root mean square of 1 - cos(e) for a normal error e of the heading; u is its mean.
-        variance = self._heading_variance()
+        variance = self.covariance.yawyaw
         if variance <= MAX_HEADING_VARIANCE:
-            missed = (self.columns[k][2] for k in MISSED.values() if k not in OPEN)
-            variance = sum([yaw * yaw for yaw in missed])
+            variance = sum([yaw * yaw for _, _, yaw in self.columns[len(PARAMETERS) :]])
         if not variance:
             return 0.0
         u = -math.expm1(-variance / 2)
@@ -324,26 +301,6 @@ class Uncertainty(Struct):
         self.bend.rolled += 2 * abs(distance)
         if self.bend.rolled > BEND_M:
             self._bend()
-        self._publish()
-
-    def settle(self, cause: Missed, other: Missed | None) -> None:
-        """Take a cause back: it missed nothing, or belongs to the `other` one."""
-        i, column = MISSED[cause], self.columns[MISSED[cause]]
-        self._bend()
-        sums, columns = self.bend.of_causes, [*self.columns]
-        if other:
-            k = MISSED[other]
-            x, y, yaw = columns[k]
-            columns[k] = x + column[0], y + column[1], yaw + column[2]
-            rows = [(CAUSES * i + n, CAUSES * k + n) for n in range(CAUSES)]
-            rows += [(CAUSES * n + i, CAUSES * n + k) for n in range(CAUSES)]
-            for one, both in rows:
-                sums[both] = sums[both][0] + sums[one][0], sums[both][1] + sums[one][1]
-        for n in range(CAUSES):
-            sums[CAUSES * i + n] = sums[CAUSES * n + i] = 0.0, 0.0
-        columns[i] = ORIGIN
-        self.columns = self.bend.columns = columns
-        self.bend.add_up()
         self._publish()
 
     def set_twist(
@@ -403,12 +360,13 @@ class Uncertainty(Struct):
         self.bend = new = Bend(p, columns, self.pose, 0.0, bend.noise, bend.of_causes, bend.added)
         total = _total(before, j)
         bending = [k for k, column in enumerate(columns) if column != ORIGIN]
-        if self._heading_variance() > MAX_HEADING_VARIANCE:
+        if self.covariance.yawyaw > MAX_HEADING_VARIANCE:
             return
         noise_xx, noise_xy, noise_yy = _bracketed(total, _difference(p, before))
         xx, xy, yy = bend.noise
-        new.noise = xx + noise_xx / 4, xy + noise_xy / 4, yy + noise_yy / 4
+        new.noise = xx, xy, yy = xx + noise_xx / 4, xy + noise_xy / 4, yy + noise_yy / 4
         sums = bend.of_causes
+        mean_x = mean_y = 0.0
         for k in bending:
             (ax, ay, ayaw), (bx, by, byaw) = columns[k], j[k]
             wx, wy, wyaw = ax - bx, ay - by, ayaw - byaw
@@ -418,7 +376,16 @@ class Uncertainty(Struct):
                 sum_x += (y * wyaw - yaw * wy) / 2
                 sum_y += (yaw * wx - x * wyaw) / 2
                 sums[CAUSES * i + k] = sum_x, sum_y
-        new.add_up()
+        # With A_ik, these sums, and independent unit normals p, E[(p' A p)^2] is the square of the
+        # trace, plus the sums of A_ik^2 and of A_ik A_ki.
+        for k in bending:
+            for i in bending:
+                x, y = sums[CAUSES * i + k]
+                of_x, of_y = sums[CAUSES * k + i]
+                xx, xy, yy = xx + x * (x + of_x), xy + x * (y + of_y), yy + y * (y + of_y)
+                if i == k:
+                    mean_x, mean_y = mean_x + x, mean_y + y
+        new.added = xx + mean_x * mean_x, xy + mean_x * mean_y, yy + mean_y * mean_y
 
     def _publish(self) -> None:
         p, (xx, xy, yy) = _total(self.p, self.columns), self.bend.added
