@@ -14,11 +14,11 @@ import pytest
 from msgspec.structs import replace
 
 import acsard
-from acsard.checkup.outcomes import OUTCOMES_BY_CODE
+from acsard.checkup.outcomes import OUTCOMES_BY_CODE, Outcome
 from acsard.core.codes import CODES, Code, StateCode, level_of, sentence
 from acsard.core.messages.schema import DiagnosticStatus, KeyValue
 from acsard.core.messages.state_warnings import warnings
-from acsard.core.tables.finding_table import Entry, code_of
+from acsard.core.tables.finding_table import NO_TEXT, Entry, code_of
 from acsard.core.tables.stop_codes import StopCode
 from acsard.machine.examination import reported
 from acsard.recording.file import SUFFIX, Recording
@@ -67,6 +67,14 @@ def literals(node: ast.expr) -> Iterator[str]:
             yield text
         case ast.IfExp(body=body, orelse=orelse):
             yield from (*literals(body), *literals(orelse))
+
+
+def test_each_name_of_a_code_has_an_entry_in_its_table_and_no_other_has() -> None:
+    names = [*map(code_of, (*get_args(Code), *get_args(Outcome)))]
+    without = [code for code in names if TABLE[code].text == NO_TEXT]
+    assert not without, f"write an entry for {without} into acsard/core/tables or outcomes.py"
+    unnamed = TABLE.keys() - set(names)
+    assert not unnamed, f"add {sorted(unnamed)} to the Literal beside its table"
 
 
 def test_every_text_and_every_advice_is_a_sentence() -> None:
