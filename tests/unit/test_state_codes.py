@@ -6,7 +6,6 @@ import ast
 import re
 import string
 from collections.abc import Iterator
-from functools import cache
 from pathlib import Path
 from typing import cast, get_args
 
@@ -48,7 +47,7 @@ def names_in(entry: Entry) -> set[str]:
     return {name for _, name, _, _ in string.Formatter().parse(parts) if name}
 
 
-@cache
+@pytest.fixture(scope="module")
 def nodes() -> list[ast.AST]:
     """Return the nodes of the package outside of the tables themselves."""
     tables = (PACKAGE / "core/tables", PACKAGE / "checkup/outcomes.py")
@@ -87,9 +86,9 @@ def test_every_text_and_every_advice_is_a_sentence() -> None:
 
 
 @pytest.mark.slow
-def test_every_call_names_a_code_and_gives_the_values_of_its_texts() -> None:
+def test_every_call_names_a_code_and_gives_the_values_of_its_texts(nodes: list[ast.AST]) -> None:
     calls = 0
-    for node in nodes():
+    for node in nodes:
         if not isinstance(node, ast.Call) or not node.args:
             continue
         name = getattr(node.func, "id", getattr(node.func, "attr", ""))
@@ -106,11 +105,11 @@ def test_every_call_names_a_code_and_gives_the_values_of_its_texts() -> None:
     assert calls > 150
 
 
-def test_every_code_is_used() -> None:
+def test_every_code_is_used(nodes: list[ast.AST]) -> None:
     """A code that nothing names is left over; an f-string names all that it can make."""
     names: set[str] = set()
     made: list[re.Pattern[str]] = []
-    for node in nodes():
+    for node in nodes:
         match node:
             case ast.Constant(value=str(text)):
                 names.add(code_of(text[:60]))
