@@ -53,7 +53,7 @@ def test_a_silence_hides_no_difference_behind_it(seconds: float, wheels: WheelMa
 
 @pytest.mark.soak
 @pytest.mark.parametrize(
-    "case", [c for c in cases() if c.silence < 0.5], ids=lambda case: case.name
+    "case", [c for c in cases() if c.silence < 0.5 and not c.mute], ids=lambda case: case.name
 )
 def test_no_wheel_fault_makes_a_wrong_pose_certain(case: Case) -> None:
     check(case)
