@@ -433,7 +433,7 @@ class Robot:
         # While the emergency stop is pressed, the motors may have no power, so wheels that do not
         # follow the commanded speeds are not a sign of a fault. Its silence tells nothing of them.
         estop = state.inputs.estop
-        pressed = estop.state == "pressed" or estop.pressed_now is PRESSED_REASON
+        pressed = estop.state == "pressed" or estop.pressed_now == PRESSED_REASON
         # Without a link the board hears nothing, and must stop the motors.
         speeds = state.out.speeds if state.session.link == "up" else STILL
         wheels.commanded = None if pressed else speeds
