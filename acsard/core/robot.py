@@ -279,6 +279,7 @@ class Robot:
                 state.count("lines_superseded")
             return
         state.count("lines_sent")
+        commanded = state.out.speeds
         motion, speeds = (AT_REST, STILL) if trip else (draft.motion, draft.speeds)
         state.out.wrote(
             self.link_setup,
@@ -290,6 +291,7 @@ class Robot:
             silent=session.silent(draft.made_ns),
             trip=bool(trip),
         )
+        state.checks.wheels.tell(commanded, state.out.pause_ns / NS_PER_S)
         if line == QUESTION_LINE:
             session.asks(at_ns)
 
@@ -318,7 +320,6 @@ class Robot:
                 if session.steps.late_s:
                     state.count("link_lost_host_stall")
             state.sanity.forget()
-        state.checks.wheels.tell(state.out.speeds)
         if session.restarted:
             # No sender drives before the link is up for the first time, so accept a zero that was
             # sent during the start.

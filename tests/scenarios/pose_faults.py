@@ -1,8 +1,6 @@
 """A sweep over faults of wheels: how wrong and how certain the pose is, from the fault on.
 
-`python -m tests.scenarios.pose_faults [NAME]` prints each case whose NEES exceeds 6, unsaid. Of
-those with silences, the tests run stalls of 0.3 s. Beyond 6 are 34 of 448 with a board that is mute
-for 0.3 s, and on a checked link 41 of 224 with stalls of 0.6 s.
+`python -m tests.scenarios.pose_faults [NAME]` prints each case whose NEES exceeds 6, unsaid.
 """
 
 from __future__ import annotations

@@ -285,7 +285,7 @@ def test_the_speed_before_a_long_silence_is_no_motion_behind_it(
     """A hand turned the wheels, for too short a time for a fault."""
     bench = Bench(counts, wheels=wheels).driven(1.0)
     bench.run(before, 0.0, 0.2)
-    bench.wheels.tell(speeds_of(after))
+    bench.wheels.tell(speeds_of(after), silence)
     bench.wheels.commanded, bench.wheels.unseen = speeds_of(after), silence
     bench.wheels.add(
         (0.0,) * 4, speeds_of(after), 0.0, None, bench.feedback, bench.kinematics, bench.count

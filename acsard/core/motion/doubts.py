@@ -6,8 +6,9 @@ in the covariance, the deviation of the distance is the difference's share of th
 the motor, and a slope that the robot drives up and down, give it back. A large difference is said,
 too. Two wheels of a side that contradict each other are in doubt by half of their difference.
 
-In a silence the board may have done something else than commanded, so its doubt is kept apart: the
-lines around it tell nothing of it, and what they show otherwise takes nothing of it back.
+In a silence the board may have obeyed any command of that time, or have stopped (`Told`). So the
+middle of what it may have done is compared, and half of the range is a doubt beside it. Both are
+kept apart: the lines around a silence tell nothing of it, and take nothing of its doubt back.
 """
 
 from __future__ import annotations
@@ -95,6 +96,7 @@ class Found(NamedTuple):
     """Angles that the pose may have missed, rad."""
 
     astray: Wheels4  # of the sides
+    reach: Wheels4  # of the sides, in a silence
     silent: bool  # a silence may be the cause
     wheels: list[tuple[SideName, Wheels4]]  # of a side whose wheels contradict each other
 
@@ -104,12 +106,12 @@ class Doubts(Struct):
     right: Trail = field(default_factory=Trail)
     # Since the last update.
     commanded: tuple[Rad, Rad] = (0.0, 0.0)  # of the left and the right side
-    before: tuple[RadPerS, RadPerS] = (0.0, 0.0)  # commanded in the last line
     rolled: Wheels4 = AT_REST
     used: Wheels4 = AT_REST  # by the pose
     seconds: Seconds = 0.0
     unknown: bool = False  # an emergency stop may have cut the power
     silent: bool = False  # a line ended a silence
+    reach: tuple[Rad, Rad] = (0.0, 0.0)  # of the sides in it, more or less than `commanded`
 
     @property
     def differs(self) -> bool:
@@ -118,17 +120,18 @@ class Doubts(Struct):
 
     def add(self, wheels: Wheels, rolled: Wheels4, seconds: Seconds) -> None:
         """Add a line, in which the wheels rolled by these angles."""
-        if wheels.commanded is None:
+        left, right = self.commanded
+        if wheels.unseen:
+            self.silent = True
+            of_left, of_right = (side.told_in_silence.until(seconds) for side in wheels.sides)
+            self.commanded = left + of_left.middle, right + of_right.middle
+            left, right = self.reach
+            self.reach = left + of_left.half, right + of_right.half
+        elif wheels.commanded is None:
             self.unknown = True
         else:
-            now = wheels.commanded.front_left, wheels.commanded.front_right
-            before, self.before = self.before, now
-            left, right = self.commanded
-            if wheels.unseen:
-                # Nobody knows which command the board obeyed in a silence.
-                self.silent = True
-                now = max(before[0], now[0], key=abs), max(before[1], now[1], key=abs)
-            self.commanded = left + now[0] * seconds, right + now[1] * seconds
+            now = wheels.commanded
+            self.commanded = left + now.front_left * seconds, right + now.front_right * seconds
         self.rolled, self.used = plus(self.rolled, rolled), plus(self.used, wheels.believed(rolled))
         if wheels.excludes:
             self.used = plus(self.used, wheels.repair)
@@ -139,7 +142,8 @@ class Doubts(Struct):
     def update(self, wheels: Wheels, lag: Seconds, count: Rad) -> Found:
         """End the open lines, and return what is in doubt now."""
         s, rolled, used = self.seconds, self.rolled, self.used
-        astray, silent, wheels_astray = AT_REST, False, list[tuple[SideName, Wheels4]]()
+        astray, reach, silent = AT_REST, AT_REST, False
+        wheels_astray = list[tuple[SideName, Wheels4]]()
         trails = (self.left, self.right)
         for trail, side, commanded in zip(trails, wheels.sides, self.commanded, strict=True):
             if s <= 0.0:
@@ -147,7 +151,7 @@ class Doubts(Struct):
             angle = (used[side.front] + used[3 - side.front]) / 2
             if all(wheels.wheels[i].rested for i in side.wheels):
                 trail.restart(0.0)
-            elif self.unknown:
+            elif self.unknown and not self.silent:
                 trail.restart(angle / s)
             else:
                 trail.follow(commanded / s, angle, s, lag)
@@ -159,9 +163,11 @@ class Doubts(Struct):
             silent, self.silent = self.silent, False
             left, right = (trail.take(lag, count, said=not silent) for trail in trails)
             astray = right, left, left, right
+            (left, right), self.reach = self.reach, (0.0, 0.0)
+            reach = right, left, left, right
         self.commanded, self.seconds, self.unknown = (0.0, 0.0), 0.0, False
         self.rolled = self.used = AT_REST
-        return Found(astray, silent, wheels_astray)
+        return Found(astray, reach, silent, wheels_astray)
 
     def forget(self) -> None:
         """Forget all doubts: the pose was set."""

@@ -12,6 +12,7 @@ from typing import Literal, NamedTuple
 
 from msgspec import Struct, field
 
+from acsard.core.link.link_state import WATCHDOG_S
 from acsard.core.motion.obedience import AGREEMENT, Expected
 from acsard.core.values import WHEELS, Event, Rad, RadPerS, Seconds, Wheels4
 
@@ -40,6 +41,37 @@ OUT_TEXTS = {
 }
 
 
+class Told(Struct, frozen=True):
+    """The commands of a time, of which the board may have obeyed any, each at most until its end.
+
+    Without lines, it stops after `WATCHDOG_S`.
+    """
+
+    slowest: RadPerS = 0.0
+    fastest: RadPerS = 0.0
+    seconds: Seconds = 0.0
+    least: Rad = 0.0  # that the wheels may have turned in it
+    most: Rad = 0.0
+
+    def then(self, command: RadPerS, s: Seconds) -> Told:
+        """Return these, and a command of `s`."""
+        slow, *_, fast = sorted((self.slowest, self.fastest, command), key=abs)
+        least, most = self.least + slow * min(s, WATCHDOG_S), self.most + fast * s
+        return Told(slow, fast, self.seconds + s, least, most)
+
+    def until(self, s: Seconds) -> Told:
+        """Return these for at least `s`."""
+        return self.then(self.fastest, max(0.0, s - self.seconds))
+
+    @property
+    def middle(self) -> Rad:
+        return (self.least + self.most) / 2
+
+    @property
+    def half(self) -> Rad:
+        return (self.most - self.least) / 2
+
+
 class Block(NamedTuple):
     """The sums of some lines, and the bounds for them."""
 
@@ -59,9 +91,8 @@ class Side(Struct):
     expected: RadPerS = 0.0  # behind the whole response time
     halfway: RadPerS = 0.0  # behind half of it
     due: Expected = field(default_factory=Expected)
-    # The least and the largest command since the last line, and in the silence before the block.
-    told: tuple[RadPerS, RadPerS] = (0.0, 0.0)
-    told_in_silence: tuple[RadPerS, RadPerS] = (0.0, 0.0)
+    told: Told = field(default_factory=lambda: Told())  # since the last line
+    told_in_silence: Told = field(default_factory=lambda: Told())  # before the block
     angle: Rad = 0.0  # commanded since the last step, and the same behind the lags
     half_angle: Rad = 0.0
     whole_angle: Rad = 0.0
@@ -86,10 +117,6 @@ class Side(Struct):
     @property
     def wheels(self) -> tuple[int, ...]:
         return (self.front,) if self.front == self.rear else (self.front, self.rear)
-
-    def tell(self, command: RadPerS) -> None:
-        """Take a command that the wheels may follow."""
-        self.told = min(command, self.told[0]), max(command, self.told[1])
 
     def expect(self, command: RadPerS, s: Seconds, lag: Seconds) -> None:
         """Add what a wheel that follows the command behind a lag rolls in a block."""

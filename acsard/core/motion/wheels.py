@@ -35,6 +35,7 @@ from acsard.core.motion.sides import (
     PARTNER_S_PER_RAD,
     Block,
     Side,
+    Told,
 )
 from acsard.core.motion.standstill import COMMANDED, Standstill
 from acsard.core.motion.wheel import REST_S, Wheel
@@ -161,15 +162,15 @@ class Wheels(Struct):
             return
         self._end_block(feedback, kinematics, count)
 
-    def tell(self, commanded: WheelSpeeds) -> None:
-        """Take a command that is written, with or without lines: the wheels may follow it."""
+    def tell(self, commanded: WheelSpeeds, s: Seconds) -> None:
+        """Take what was commanded until now for `s`, with or without lines."""
         for side, speed in zip(self.sides, _of_sides(commanded), strict=True):
-            side.tell(speed)
+            side.told = side.told.then(speed, s)
 
     def _heed(self) -> None:
         self.heeded = commanded = self.commanded
         for side, speed in zip(self.sides, _of_sides(commanded or STILL), strict=True):
-            side.told = speed, speed
+            side.told = Told(speed, speed)
 
     def forget(self) -> None:
         """Drop the evidence of faults: one was cleared."""
@@ -280,8 +281,12 @@ class Wheels(Struct):
             self._obey(block.unit)
         pairs = zip(self.wheels, ends, strict=False)
         speeds = [_nearer(wheel.speed, speed) if short else 0.0 for wheel, speed in pairs]
-        before = [(*side.told_in_silence, *side.smooth) for side in self.sides]
-        if any(abs(speed) >= COMMANDED for side in self.sides for speed in side.told_in_silence):
+        told = [side.told_in_silence for side in self.sides]
+        before = [
+            (some.slowest, some.fastest, *side.smooth)
+            for some, side in zip(told, self.sides, strict=True)
+        ]
+        if any(abs(some.fastest) >= COMMANDED for some in told):
             for wheel in self.wheels:
                 wheel.end_rest()
         if not short:
