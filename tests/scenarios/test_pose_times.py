@@ -18,6 +18,7 @@ from acsard.core.config.settings import (
     WheelMap,
 )
 from acsard.core.values import Estimate, Received
+from tests.scenarios.boards import blocks
 from tests.scenarios.world import World
 from tests.stepped import Outputs
 from tests.wheels import four_and_two
@@ -52,6 +53,34 @@ def test_the_pose_of_a_pushed_robot_is_right_although_stop_lines_leave_late(link
     off = at - [estimate.pose.x for estimate in estimates]
     assert np.abs(off).max() < 0.025
     assert at[-1] > 1.5
+
+
+@pytest.mark.parametrize("rate", [10.0, 20.0, 100.0])
+@pytest.mark.parametrize("held", ["by the host", "by the board"])
+def test_the_clock_of_the_board_dates_lines_that_come_together(rate: float, held: str) -> None:
+    """A USB hub holds its lines back, or the firmware blocks: its clock shows which of them."""
+    mcu = McuConfig(link_check="on", encoder_counts=COUNTS)
+    world = World(Config(mcu=mcu, control=ControlConfig(rate=rate)))
+    estimates, true = list[Estimate](), list[tuple[int, float]]()
+
+    def watch(outputs: Outputs) -> None:
+        estimates.extend(outputs.estimates)
+        world.mcu.advance(world.now_ns)
+        true.append((world.now_ns, world.mcu.vehicle.pose.x))
+
+    world.run(1.0)
+    world.drive(0.6, 0.0, 3.0)
+    world.watch = watch
+    if held == "by the board":
+        blocks(world.mcu, 1.0, 0.15)
+        world.drive(0.6, 0.0, 6.0)
+    else:
+        with world.mcu.fault("stalls", 1.0, 0.15):
+            world.drive(0.6, 0.0, 6.0)
+    times, places = zip(*true, strict=True)
+    at = np.interp([estimate.at.mono_ns for estimate in estimates], times, places)
+    off = at - [estimate.pose.x for estimate in estimates]
+    assert np.ptp(off) < 0.6 * 0.01
 
 
 class Gap:

@@ -247,8 +247,10 @@ class Reasons:
         for sender in self._fresh_senders(source, now_ns):
             clock, certain = sender.clock, not (sender.shared and source in self._junk)
             if sender.echoes:
-                certain &= sender.armed_ns > sender.old_ns
                 odd = clock is not None and clock.odd
+                # A zero that is not newer than what another program of this identity sent, or that
+                # a command overtook, is refused and arms nothing.
+                certain &= sender.armed_ns > sender.old_ns and not odd
                 if odd or now_ns - sender.old_ns < 2 * timeout_ns + MARGIN_NS:
                     causes.add("late")
             elif clock is None:

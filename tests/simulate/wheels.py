@@ -43,6 +43,12 @@ TURNS = 0.05
 TOO_FAST, FAST_NS = 1.25, 3 * NS // 2
 """Share of the fastest command, and the time, after which a robot is certainly too fast."""
 
+FIFTH, BEYOND_RAD, BEYOND_COUNTS = 1.2, 0.3, 2.5
+"""`feedback.response_time` of the manual: a fifth faster, by 0.3 rad and 2.5 counts, is a fault."""
+
+SMOOTHED_COUNTS = 3
+"""The daemon smooths the speed of a coarse encoder over three counts: it shows the way later."""
+
 NAMED_S = 1.5
 """Within this time more, `state` names the wheel: a coarse encoder is smoothed over a second."""
 
@@ -60,8 +66,8 @@ class Wheels:
         self._response_ns = max(DEAD_TIME_NS, int(3 * max(response_s, lag_s) * NS))
         self._roll = max(ROLL_RAD, ROLL_COUNTS * math.tau / counts)
         declared = config["mcu"].get("encoder_counts") or LEAST_COUNTS
-        self._seen = max(ROLL_RAD, ROLL_COUNTS * math.tau / min(counts, declared))
-        """A roll that the daemon's encoders show for certain, rad."""
+        self._count = math.tau / min(counts, declared)
+        """The angle of a count, or the one that the daemon assumes, if that is more, rad."""
         self._step_ns = 0
         self._commands = [0.0] * 4
         """The command at the last change of each wheel, rad/s."""
@@ -74,6 +80,8 @@ class Wheels:
         self._recent: list[tuple[int, float]] = []
         """Times and the fastest commands of the last three response times, rad/s."""
         self._fast_ns: int | None = None
+        self._beyond = 0.0
+        """Way beyond a fifth more than commanded, since then, rad."""
 
     def _forget(self, at_ns: int) -> None:
         self._since_ns, self._rolled, self._fast_ns = [at_ns] * 4, [0.0] * 4, None
@@ -122,7 +130,7 @@ class Wheels:
                 text = f"wheel {place} turns at {speed:.2f} rad/s for {command:.2f} rad/s"
                 text += f", and has rolled {self._rolled[place]:.2f} rad"
                 raise BrokenError("a wheel that does not obey is found", at_ns, text)
-        self._too_fast(at_ns, min(map(abs, speeds)))
+        self._too_fast(at_ns, min(map(abs, speeds)), passed_ns / NS)
 
     def _named(self, at_ns: int, place: int, seconds: float, speed: float) -> None:
         """Check that `state` names a wheel that does not turn, or seems not to."""
@@ -157,15 +165,19 @@ class Wheels:
         if not re.search(rf"\b{name} wheel", text):
             raise BrokenError("a stuck encoder is named", at_ns, f"{name}: {text!r}")
 
-    def _too_fast(self, at_ns: int, slowest: float) -> None:
-        """Check that a robot all of whose wheels are too fast is stopped."""
+    def _too_fast(self, at_ns: int, slowest: float, seconds: float) -> None:
+        """Check that a robot all of whose wheels are too fast is stopped.
+
+        What counts is how far they rolled beyond a fifth more than commanded, not how far at all: a
+        robot that is only a little too fast rolls far until a coarse encoder shows it.
+        """
         fastest = max(command for _, command in self._recent)
         if fastest < 0.5 or slowest < TOO_FAST * fastest:
-            self._fast_ns = None
+            self._fast_ns, self._beyond = None, 0.0
             return
         self._fast_ns = self._fast_ns or at_ns
-        rolled = slowest * (at_ns - self._fast_ns) / NS
-        coarse = 7 * self._seen
-        if at_ns - self._fast_ns > FAST_NS + self._response_ns and rolled > coarse:
+        self._beyond += (slowest - FIFTH * fastest) * seconds
+        most = max(BEYOND_RAD, BEYOND_COUNTS * self._count) + SMOOTHED_COUNTS * self._count
+        if at_ns - self._fast_ns > FAST_NS + self._response_ns and self._beyond > most:
             text = f"all wheels turn at {slowest:.2f} rad/s, commanded were {fastest:.2f} rad/s"
             raise BrokenError("a robot that is too fast is stopped", at_ns, text)

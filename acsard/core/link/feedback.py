@@ -175,23 +175,24 @@ class Timeline(Struct):
             self.burst_ns = 0
         held_ns = came_ns - self.burst_ns - expected_ns
         held_ns = held_ns if held_ns < 0 else max(0, held_ns - waited_ns)
-        shift_ns, late_ns = self._shift(held_ns, dt_ns)
+        by_board, self.restarted = None, False
+        if reading is not None and setup.count:
+            by_board = self._turned(setup, reading, came_ns)
+        elif self.encoders.last is not None:
+            self.encoders.forget()
+        shift_ns, late_ns = self._shift(held_ns, dt_ns, by_board)
         bridged_ns = max(0, bridged_ns + min(0, shift_ns))  # the time is in a line before it
         dt, bridged, gap = (dt_ns + shift_ns) / NS_PER_S, bridged_ns / NS_PER_S, 0.0
         late = late_ns / NS_PER_S
-        known, turned, doubt, self.restarted = self.begun, None, None, False
+        known, turned, doubt = self.begun, None, None
         if bridged > 0.0:
             self.gaps += 1
-        if reading is not None and setup.count:
-            by_board = self._turned(setup, reading, came_ns)
-            if by_board is not None:
-                check, by_counts = self.counts_check, setup.codec.wheels(by_board.motors)
-                dt = since = by_board.dt
-                if not bridged and dt <= setup.covered_s:
-                    doubt = check.add(by_counts, speeds.as_tuple(), dt, setup.count)
-                bridged, known, turned, late = 0.0, known and not silent, by_counts, 0.0
-        elif self.encoders.last is not None:
-            self.encoders.forget()
+        if by_board is not None:
+            check, by_counts = self.counts_check, setup.codec.wheels(by_board.motors)
+            dt = since = by_board.dt
+            if not bridged and dt <= setup.covered_s:
+                doubt = check.add(by_counts, speeds.as_tuple(), dt, setup.count)
+            bridged, known, turned, late = 0.0, known and not silent, by_counts, 0.0
         if not known or self.restarted or dt >= MAX_FILLED_GAP_S:
             gap = 0.0 if last is None else max(since, dt)
             dt = bridged = since = late = 0.0
@@ -235,12 +236,15 @@ class Timeline(Struct):
             came_ns,
         )
 
-    def _shift(self, held_ns: Ns, dt_ns: Ns) -> tuple[Ns, Ns]:
-        # A line that came later than an adapter holds it was made when it came: firmware that
-        # blocks answers all that waits at once, and its first answer has the motion of that time.
-        # The time between is a doubt. Returns by how much the shift and this time have grown.
+    def _shift(self, held_ns: Ns, dt_ns: Ns, by_board: Turned | None) -> tuple[Ns, Ns]:
+        # A line that came later than an adapter holds it was made when it came, unless the clock of
+        # the board says when: firmware that blocks answers all that waits at once, and its first
+        # answer has the motion of that time. The time between is a doubt. Returns by how much the
+        # shift and this time have grown.
         shifted_ns, before_ns = self.shifted_ns, self.held_ns
         shift_ns = held_ns if held_ns > MAX_ADAPTER_DELAY_NS else 0
+        if by_board is not None:
+            shift_ns = min(shift_ns, max(0, shifted_ns + int(by_board.dt * NS_PER_S) - dt_ns))
         shift_ns = max(shift_ns, shifted_ns - dt_ns)  # not before the line before it
         self.shifted_ns, self.held_ns = shift_ns, held_ns
         return shift_ns - shifted_ns, self.held_ns - before_ns
