@@ -38,6 +38,8 @@ from typing import NamedTuple
 import pytest
 from hypothesis import Phase, settings
 
+from tests.conftest import ANY_SPEED
+
 TESTS = ("tests/unit", "tests/scenarios", "tests/simulate", "tests/test_*.py")
 PYTEST = ["-n", "0", "-s", "-qq", "--disable-warnings", "-p", "no:cacheprovider"]
 PYTEST += ["--hypothesis-seed=0", "--timeout", "90"]
@@ -215,6 +217,7 @@ class Trials:
 
     def run(self) -> None:
         """Collect the tests, and call `work`."""
+        os.environ[ANY_SPEED] = "1"  # the recorded lines take time
         tests = [path for name in self._tests for path in sorted(self._root.glob(name))]
         if pytest.main([*PYTEST, *map(str, tests)], [self]) != 0:
             raise RuntimeError("the tests cannot be collected")

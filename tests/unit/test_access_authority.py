@@ -5,9 +5,11 @@ OpenSSL checks this in the tests.
 
 from __future__ import annotations
 
+import errno
 import os
 import ssl
 import tempfile
+from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 
@@ -16,9 +18,10 @@ from cryptography import x509
 from cryptography.hazmat.primitives import serialization
 from cryptography.hazmat.primitives.asymmetric import ec, ed25519
 
-from acsard.host.errors import MendableError
+from acsard.host.errors import MendableError, NotPermittedError
+from acsard.machine import authority as making
 from acsard.machine.authority import Authority
-from acsard.machine.certificates import CA_KEY
+from acsard.machine.certificates import CA_KEY, add, renew, renew_client
 from tests.each import each
 
 OWN = ["robot1", "robot.example", "203.0.113.9", "2001:db8:1:2::9"]
@@ -107,7 +110,34 @@ def test_a_directory_that_refuses_a_file_is_named_with_the_remedy() -> None:
         os.chmod(where, 0o755)
         os.seteuid(65534)
         try:
-            with pytest.raises(MendableError, match=r"cannot write .*: Permission denied; .* run "):
+            with pytest.raises(NotPermittedError, match=r"cannot write .*: Permission denied; "):
                 Authority.make(Path(where), "test", 1)
         finally:
             os.seteuid(0)
+
+
+def test_a_full_disk_is_no_question_of_permission(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(*_: object, **__: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(making, "replace", full)
+    with pytest.raises(MendableError, match=r"ca-key\.pem: No space left on device; ") as error:
+        Authority.make(tmp_path, "test", 1)
+    assert not isinstance(error.value, NotPermittedError)
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="needs root, to become a user without permission")
+@each("work", [add, renew_client, lambda where, *more: renew(where, *more[1:])])
+def test_another_user_may_not_sign_even_if_the_key_can_be_read(work: Callable[..., object]) -> None:
+    with tempfile.TemporaryDirectory() as where:
+        Authority.make(Path(where), "test", 1)
+        for path in (Path(where), Path(where) / CA_KEY):
+            path.chmod(0o755)
+        os.setresuid(65534, 65534, 0)
+        try:
+            with pytest.raises(NotPermittedError, match="run this command with sudo"):
+                work(Path(where), "anna", [], 1)
+        finally:
+            os.setresuid(0, 0, 0)

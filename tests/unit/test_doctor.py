@@ -11,6 +11,7 @@ import socket
 import stat
 import subprocess
 import sys
+import time
 from collections.abc import Iterable
 from contextlib import nullcontext
 from pathlib import Path
@@ -45,7 +46,7 @@ from acsard.machine.examination import (
 from acsard.machine.finding import Finding
 from acsard.machine.local_findings import scheduling, serial_port, slowness, unused_version
 from acsard.machine.serial_ports import BOARDS
-from tests.unit.kernel_files import HWMON, POLICY, QUIET, write
+from tests.unit.kernel_files import COUNT, HWMON, POLICY, QUIET, write
 
 INFO = Info("acsar", "1.2", 77, "/dev/pts/3", False, 100.0, [], [])
 FILE = Config()
@@ -132,7 +133,7 @@ def test_what_does_not_answer_has_its_code(
 
 
 def test_the_file_s_values_are_ok() -> None:
-    assert [finding.level for finding in compared(FILE, FILE)] == ["ok"]
+    assert [(one.code, one.level) for one in compared(FILE, FILE)] == [("configuration_same", "ok")]
 
 
 def test_values_of_command_line_options_are_no_warning() -> None:
@@ -149,6 +150,7 @@ def test_values_of_command_line_options_are_no_warning() -> None:
         (["127.0.0.1"], "tcp/127.0.0.1:{}", ["bus"]),  # the router listens on this one, too
         ([], "tcp/127.0.0.1:{}", []),
         ([], "tcp/router.local:{}", ["bus"]),
+        ([], "tls/router.local:{}", []),
     ],
 )
 def test_a_router_without_tls_is_warned_of_unless_only_this_machine_reaches_it(
@@ -175,6 +177,19 @@ class OfAnotherRobot:
         raise NoAnswerError(key)
 
 
+@pytest.mark.parametrize(("config", "code"), [(FILE, ""), (None, "configuration_secret")])
+def test_a_daemon_with_the_simulator_has_no_port_and_may_keep_its_values_secret(
+    config: Config | None, code: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert FILE.mcu.simulated
+    running = Running(INFO, config, (), "")
+    monkeypatch.setattr(examination, "query_or_finding", lambda *_: running)
+    monkeypatch.setattr(examination, "computer", lambda *_: ())
+    found = codes(examine("x", b"", {}))
+    assert "port_simulated" not in found
+    assert found[-1:] == [code] or not code
+
+
 @pytest.mark.parametrize(("robot", "judged"), [("acsar", True), ("robot1", False)])
 def test_a_robot_is_judged_by_its_own_file_only(
     robot: str, judged: bool, monkeypatch: pytest.MonkeyPatch
@@ -195,6 +210,21 @@ def test_values_that_were_set_and_sources_that_only_the_file_has_are_a_warning()
     assert "limits.linear_speed = 0.4, not " in finding.text
     assert f"commands.sources.{FILE.commands.sources[0].name}.priority" in finding.text
     assert "`acsard set`" in finding.mend
+
+
+@pytest.mark.parametrize(("count", "rest"), [(6, ""), (8, "and 2 more")])
+def test_six_values_that_differ_are_named_and_the_number_of_the_others(
+    count: int, rest: str
+) -> None:
+    names = [
+        "linear_speed", "angular_speed", "linear_acceleration", "angular_acceleration",
+        "linear_deceleration", "angular_deceleration", "linear_stop_deceleration",
+        "angular_stop_deceleration",
+    ][:count]  # fmt: skip
+    limits = replace(FILE.limits, **dict.fromkeys(names, 0.123))
+    (finding,) = compared(replace(FILE, limits=limits), FILE)
+    assert finding.text.count("limits.") == 6
+    assert finding.text.endswith(rest)
 
 
 @pytest.mark.parametrize(
@@ -373,6 +403,16 @@ def test_each_present_cause_of_lateness_is_a_warning_with_a_remedy(tmp_path: Pat
     assert "power supply" in findings[0].mend
     assert "powersave keeps the processor at 600 of 1500 MHz" in findings[1].text
     assert "schedutil" in findings[1].mend
+
+
+def test_heat_during_the_measurement_is_named_and_that_of_before_is_not(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    kernel = Kernel(write(tmp_path, QUIET | {COUNT: "5\n"}))
+    for count, code in (("5", "computer_well"), ("6", "computer_hot"), ("6", "computer_well")):
+        files = {COUNT: f"{count}\n"}
+        monkeypatch.setattr(time, "sleep", lambda _, f=files: write(tmp_path, f))
+        assert codes(slowness(kernel)) == [code]
 
 
 def test_a_newer_version_that_is_not_in_use_is_a_warning_with_the_command(

@@ -262,6 +262,19 @@ def test_the_files_are_those_of_deploy_with_the_port_of_a_real_robot() -> None:
     assert b'port = "/dev/acsar"' in configuration.content
 
 
+def test_force_replaces_each_changed_file_but_the_configuration(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in ("CONFIG_DIRECTORY", "UNIT_DIRECTORY"):
+        monkeypatch.setattr(service_installation, name, tmp_path)
+    monkeypatch.setattr(service_installation, "RULES", tmp_path / RULES.name)
+    for file in files():
+        file.path.write_text("mine")
+    steps = installing(files(), force=True)
+    kept = [step.path.name for step in steps if isinstance(step, Keep)]
+    assert (kept, sum(isinstance(step, Write) for step in steps)) == (["acsard.toml"], 4)
+
+
 def test_after_a_write_and_a_removal_the_directory_is_unchanged(tmp_path: Path) -> None:
     (tmp_path / "elsewhere").write_text("untouched")
     file = File(tmp_path / "acsard" / "tool", b"new", 0o755)

@@ -12,8 +12,11 @@ from pathlib import Path
 import msgspec
 import pytest
 
+import acsard
+from acsard.host import version as own
 from acsard.host.errors import MendableError
 from acsard.machine import upgrade, versions
+from acsard.machine.deploy_files import PACKAGED
 from acsard.machine.upgrade import Look, UnitState, prepare, worse
 from tests.unit.screens import STATE
 
@@ -102,6 +105,64 @@ def test_the_copy_has_acsard_and_the_libraries_of_its_users_but_no_developer_s()
     assert {"acsard", "eclipse-zenoh", "numpy", "aiohttp", "foxglove-sdk"} <= names
     assert {"multidict", "markdown-it-py"} <= names, "the libraries of libraries"
     assert not {"pytest", "mypy", "hypothesis"} & names
+
+
+def test_a_copy_runs_by_itself_with_the_files_and_the_commit_of_its_source(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The package of the environment is a small one that says its arguments."""
+    package = tmp_path / "environment" / "acsard"
+    for directory in PACKAGED:
+        (package.parent / "deploy" / directory).mkdir(parents=True)
+        (package.parent / "deploy" / directory / "README").write_text(directory)
+    (package.parent / "deploy" / "systemd" / versions.STOP_PROGRAM).write_text("#!/bin/sh\n")
+    (package.parent / "acsard.toml").write_text("# all defaults\n")
+    (package / "__pycache__").mkdir(parents=True)
+    (package / "__pycache__" / "old.pyc").touch()
+    (package / "__init__.py").touch()
+    (package / "cli.py").write_text("import sys\ndef entry():\n    print(*sys.argv[1:])\n")
+    monkeypatch.setattr(acsard, "__file__", str(package / "__init__.py"))
+    monkeypatch.setattr(versions, "closure", list)
+    for commit in ("", "0123456789.dirty"):
+        monkeypatch.setattr(own, "source", lambda commit=commit: commit)
+        home = tmp_path / f"opt{commit}"
+        versions.make_home(home)
+        copied = home / versions.copy(home)
+        ours = copied / "lib" / "acsard"
+        program = copied / "bin" / "acsard"
+        done = subprocess.run([program, "a", "b"], capture_output=True, text=True, check=True)
+        assert done.stdout == "a b\n"
+        programs = {program, copied / "bin" / versions.STOP_PROGRAM}
+        for path in copied.rglob("*"):
+            runs = path in programs or path.is_dir()
+            assert path.stat().st_mode & 0o7777 == (0o755 if runs else 0o644), path
+        assert [path.name.partition(".")[0] for path in sorted(ours.glob("__pycache__/*"))] == [
+            "__init__", "cli",
+        ]  # fmt: skip
+        kept = ours / own.COMMIT_FILE
+        assert (kept.read_text() if kept.exists() else "") == (f"{commit}\n" if commit else "")
+        deploy = versions.deploy_of(copied.name, home)
+        assert {path.parent.name for path in deploy.glob("*/README")} == {*PACKAGED}
+        assert (deploy / "acsard.toml").read_text() == "# all defaults\n"
+
+
+@pytest.mark.parametrize("succeeds", [True, False])
+def test_a_copy_waits_for_the_disk_also_if_the_program_sync_cannot_wait_for_one_disk(
+    succeeds: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    program, synced = tmp_path / "bin" / "sync", list[str]()
+    program.parent.mkdir()
+    program.write_text(f"#!/bin/sh\necho $@ >{tmp_path}/asked\nexit {int(not succeeds)}\n")
+    program.chmod(0o755)
+    monkeypatch.setenv("PATH", str(program.parent), prepend=os.pathsep)
+    monkeypatch.setattr(os, "sync", lambda: synced.append("all disks"))
+    monkeypatch.setattr(versions, "_fill", lambda place, python: (place / "lib").mkdir())
+    monkeypatch.setattr(versions, "_require_start", lambda place: None)
+    home = tmp_path / "opt"
+    home.mkdir()
+    versions.copy(home)
+    assert (tmp_path / "asked").read_text().startswith(f"--file-system {home}/")
+    assert synced == ["all disks"] * (not succeeds)
 
 
 def test_a_full_disk_leaves_no_part(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
