@@ -115,6 +115,18 @@ def test_a_runaway_is_judged_by_the_speed_of_the_step_until_the_motors_stand() -
         assert "more than 30 rad/s" in end.value.finding.text
 
 
+@each(("gain", "code"), [(3.0, "runaway_along"), (-3.0, "runaway_against")])
+@each("speed", [3.0, -3.0])
+def test_a_runaway_goes_with_its_command_or_against_it(
+    gain: float, code: str, speed: float
+) -> None:
+    robot = Reported(lambda measured: gain * measured)
+    with robot.board() as board, pytest.raises(StoppedError) as end:
+        board.drive(board.only([1], speed), 1.0)
+    assert end.value.finding.code == code
+    assert "motor b" in end.value.finding.name + end.value.finding.text
+
+
 def test_a_restart_at_high_speed_leaves_the_high_bound_until_the_motors_stand() -> None:
     robot = Robot("plain_only")
     with robot.board() as board:
