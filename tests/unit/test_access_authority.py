@@ -11,11 +11,12 @@ import ssl
 import tempfile
 from collections.abc import Callable
 from contextlib import suppress
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 import pytest
 from cryptography import x509
-from cryptography.hazmat.primitives import serialization
+from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric import ec, ed25519
 
 from acsard.host.errors import MendableError, NotPermittedError
@@ -88,6 +89,36 @@ def test_an_authority_of_another_program_without_constraints_may_sign_for_any_na
     certificate = x509.load_pem_x509_certificate((tmp_path / "certificate.pem").read_bytes())
     key = ec.generate_private_key(ec.SECP256R1())
     assert Authority(certificate, key).permits("bank.example")
+
+
+def test_a_certificate_of_an_authority_without_an_identifier_names_its_key(tmp_path: Path) -> None:
+    key, name = ec.generate_private_key(ec.SECP256R1()), x509.Name([])
+    now = datetime.now(UTC)
+    builder = x509.CertificateBuilder(name, name, key.public_key(), 1, now, now + timedelta(days=1))
+    Authority(builder.sign(key, hashes.SHA256()), key).issue(tmp_path, "robot", [], 1)
+    issued = x509.load_pem_x509_certificate((tmp_path / "certificate.pem").read_bytes())
+    found = issued.extensions.get_extension_for_class(x509.AuthorityKeyIdentifier).value
+    assert found == x509.AuthorityKeyIdentifier.from_issuer_public_key(key.public_key())
+
+
+@each(
+    ("name", "names"),
+    [
+        ("robot4", ["robot4.local"]),
+        ("robot1", ["robot1", "robot1.local"]),  # one of the authority's own names
+        ("a.person", ["a.person.local"]),
+        ("arm.local", ["arm.local"]),
+        ("192.168.1.7", ["192.168.1.7.local", "192.168.1.7"]),
+        ("8.8.8.8", ["8.8.8.8.local"]),
+        ("anna+ben", []),
+    ],
+)
+def test_a_client_has_the_host_names_that_its_name_can_be_and_the_authority_permits(
+    name: str, names: list[str]
+) -> None:
+    with tempfile.TemporaryDirectory() as where:
+        authority = Authority.make(Path(where), "test", 1, OWN)
+        assert authority.names_in(add(Path(where), name, [], 1)) == names
 
 
 def test_an_authority_whose_key_is_of_another_kind_is_refused(tmp_path: Path) -> None:

@@ -6,6 +6,7 @@ import math
 import re
 from collections.abc import Iterator
 from contextlib import contextmanager
+from typing import Any
 
 import pytest
 from msgspec import structs
@@ -127,7 +128,7 @@ def test_an_encoder_without_counts_is_coarse_if_its_speeds_jump(
 class Seldom(Robot):
     """A robot that leaves out replies sooner than `gap_s` behind another one, and delays all."""
 
-    def __init__(self, gap_s: float, late_s: float = 0.0, **mcu: object) -> None:
+    def __init__(self, gap_s: float, late_s: float = 0.0, **mcu: Any) -> None:
         super().__init__("plain_only", **mcu)
         self._gap_ns, self._late_ns, self._last_ns = int(gap_s * 1e9), int(late_s * 1e9), 0
         self._held = list[tuple[int, bytes]]()

@@ -159,6 +159,8 @@ class Answering:
     Without speeds it is silent. A pause of the upgrade advances its time.
     """
 
+    new_link = "up"  # of the version `NEW`
+
     def __init__(self, speeds: Iterable[tuple[float, float]]) -> None:
         self.now_s, self._speeds = 0.0, [*speeds]
 
@@ -168,7 +170,10 @@ class Answering:
         linear, angular = self._speeds[min(int(self.now_s), len(self._speeds) - 1)]
         twist = Twist(Vector3(linear, 0.0, 0.0), Vector3(0.0, 0.0, angular))
         # The wheels of a heavy robot have not begun to turn.
-        state = msgspec.structs.replace(STATE, wheels=[0.0] * 4, reason="commanded by nav")
+        link = self.new_link if versions.current() == NEW else "up"
+        state = msgspec.structs.replace(
+            STATE, wheels=[0.0] * 4, reason="commanded by nav", link=link
+        )
         return {"cmd_vel_out": SimpleNamespace(twist=twist), "state": state}[key]
 
     def sleep(self, seconds: float) -> None:
@@ -220,6 +225,19 @@ def test_a_running_robot_is_changed_when_it_has_stood_for_two_seconds(
         f"version {NEW} is in use",
         f"version {NEW} works",
     ]
+
+
+def test_a_version_that_loses_the_link_of_the_one_before_is_left_again(
+    machine: Machine, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    machine.state(UNIT, "active")
+    daemon = Answering([STANDS])
+    daemon.new_link = "down"
+    daemon.answer(monkeypatch)
+    trouble = rf"{NEW} has no link to the microcontroller \(down\); version {OLD} runs again"
+    with pytest.raises(MendableError, match=trouble):
+        change(NEW, machine.said.append, watch_s=1.0)
+    assert machine.links == (OLD, "")
 
 
 def test_a_daemon_that_accepts_a_connection_and_stays_silent_is_not_changed(

@@ -7,6 +7,7 @@ import os
 import shutil
 import subprocess
 import sys
+from importlib.metadata import Distribution
 from pathlib import Path
 
 import msgspec
@@ -100,11 +101,51 @@ def test_a_python_in_a_home_directory_is_replaced_by_the_system_s_or_refused() -
     assert f"apt install python3.{sys.version_info.minor}" in str(refusal.value)
 
 
+@pytest.mark.parametrize("closed", ["executable", "base_prefix"])
+def test_neither_the_python_nor_its_library_may_be_hidden_from_the_service(
+    closed: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    place = tmp_path / "python"
+    place.touch()
+    monkeypatch.setattr(sys, "executable", "/usr/bin/env")
+    monkeypatch.setattr(sys, "base_prefix", "/usr")
+    assert versions.service_python((str(tmp_path),)) == os.path.realpath("/usr/bin/env")
+    monkeypatch.setattr(sys, closed, str(place))
+    monkeypatch.setattr(os, "access", lambda *_: False)
+    with pytest.raises(MendableError, match="services have no access to home directories"):
+        versions.service_python((str(tmp_path),))
+
+
 def test_the_copy_has_acsard_and_the_libraries_of_its_users_but_no_developer_s() -> None:
     names = {package.name.lower() for package in versions.closure()}
     assert {"acsard", "eclipse-zenoh", "numpy", "aiohttp", "foxglove-sdk"} <= names
     assert {"multidict", "markdown-it-py"} <= names, "the libraries of libraries"
     assert not {"pytest", "mypy", "hypothesis"} & names
+
+
+def installed(site: Path, name: str, *files: str) -> None:
+    """Install a package with these files in a directory, as pip does."""
+    about = f"{name}-1.dist-info"
+    (site / about).mkdir(parents=True)
+    (site / about / "METADATA").write_text(f"Name: {name}\nVersion: 1\n")
+    for file in files:
+        (site / file).parent.mkdir(parents=True, exist_ok=True)
+        (site / file).touch()
+    listed = [*files, f"{about}/METADATA", f"{about}/RECORD"]
+    (site / about / "RECORD").write_text("".join(f"{file},,\n" for file in listed))
+
+
+def test_a_library_that_another_program_installed_cannot_be_copied(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    installed(tmp_path, "other")
+    (tmp_path / "other-1.dist-info" / "RECORD").unlink()
+    monkeypatch.setattr(
+        versions, "closure", lambda: [Distribution.at(tmp_path / "other-1.dist-info")]
+    )
+    with pytest.raises(MendableError, match="the library other has no list of its files"):
+        versions.copy(tmp_path)
+    assert os.listdir(tmp_path) == ["other-1.dist-info"]
 
 
 def test_a_copy_runs_by_itself_with_the_files_and_the_commit_of_its_source(
@@ -122,7 +163,14 @@ def test_a_copy_runs_by_itself_with_the_files_and_the_commit_of_its_source(
     (package / "__init__.py").touch()
     (package / "cli.py").write_text("import sys\ndef entry():\n    print(*sys.argv[1:])\n")
     monkeypatch.setattr(acsard, "__file__", str(package / "__init__.py"))
-    monkeypatch.setattr(versions, "closure", list)
+    site = package.parent / "site"
+    installed(site, "other", "other/__init__.py", "../../bin/other", "other.pth", "other/data.txt")
+    # What pip writes about a clone, and of an installation what is copied from the package.
+    installed(site, "acsard", "__editable__.acsard.pth", "acsard/cli.py")
+    record = site / "other-1.dist-info" / "RECORD"
+    record.write_text(f"{record.read_text()}other/__pycache__/module.pyc,,\n")
+    closure = [Distribution.at(site / f"{name}-1.dist-info") for name in ("other", "acsard")]
+    monkeypatch.setattr(versions, "closure", lambda: closure)
     for commit in ("", "0123456789.dirty"):
         monkeypatch.setattr(own, "source", lambda commit=commit: commit)
         home = tmp_path / f"opt{commit}"
@@ -141,6 +189,15 @@ def test_a_copy_runs_by_itself_with_the_files_and_the_commit_of_its_source(
         ]  # fmt: skip
         kept = ours / own.COMMIT_FILE
         assert (kept.read_text() if kept.exists() else "") == (f"{commit}\n" if commit else "")
+        lib = copied / "lib"
+        assert {str(path.relative_to(lib)) for path in lib.glob("other*/*.*")} == {
+            "other/__init__.py", "other/data.txt",
+        }  # fmt: skip
+        assert {path.name for path in lib.iterdir()} == {
+            "acsard", "acsard-1.dist-info", "other", "other-1.dist-info"
+        }  # fmt: skip
+        assert (lib / "acsard-1.dist-info" / "METADATA").exists()
+        assert sorted(path.name for path in program.parent.iterdir()) == ["acsard", "acsard-stop"]
         deploy = versions.deploy_of(copied.name, home)
         assert {path.parent.name for path in deploy.glob("*/README")} == {*PACKAGED}
         assert (deploy / "acsard.toml").read_text() == "# all defaults\n"
