@@ -263,7 +263,7 @@ class Leaves(Nobody):
             raise KeyboardInterrupt
 
 
-@pytest.mark.parametrize("page", ["lines", "losses", "habits"])
+@pytest.mark.parametrize("page", ["good", "lines", "losses", "habits", "firmware"])
 def test_the_steps_in_which_no_motor_turns_say_what_the_whole_check_says(page: str) -> None:
     """The whole checks of these boards are slow."""
     steps = procedure.STEPS[: procedure.STEPS.index("motors")]

@@ -68,6 +68,21 @@ def test_a_step_that_a_late_moment_spoilt_is_repeated() -> None:
         assert [f.verdict for f in checked.findings] == [f.verdict for f in quiet.findings]
 
 
+def test_a_late_step_is_repeated_twice_and_all_of_them_eight_times() -> None:
+    parts = [""]
+
+    class Counts(Nobody):
+        def doing(self, text: str) -> None:
+            parts.append(text)
+
+    robot = Busy("plain_only", late_s=0.15, every=5)
+    with robot.faulty():
+        procedure.run(robot, Counts(), robot.config, lambda _: None, fast=True)
+    series = "".join("r" if "runs again" in part else " " for part in parts).split()
+    assert max(series) == "r" * procedure.LATE_AGAIN
+    assert len("".join(series)) == procedure.LATE_MOST
+
+
 @pytest.mark.variations(5)
 @pytest.mark.parametrize(
     ("fault", "name"),

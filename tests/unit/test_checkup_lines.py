@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 from msgspec import structs
 
-from acsard.checkup import damage, dialect, encoder_counts, line_loss, watchdog
+from acsard.checkup import damage, dialect, encoder_counts, line_loss, motion, watchdog
 from acsard.checkup.board import Board
 from acsard.checkup.findings import StoppedError
 from acsard.checkup.motion import SPEED, BoardReply
@@ -276,7 +276,7 @@ def turned(robot: Robot) -> Iterator[Board]:
             turn(board, motor, 3.0)
             board.stop_motors()
         yield board
-        assert board.turning() == []
+        assert motion.turning(board.replies, board.now_s) == []
 
 
 def measured(robot: Robot) -> tuple[str, str]:

@@ -6,6 +6,8 @@ from collections.abc import Sequence
 
 import pytest
 
+from acsard.checkup import procedure
+from acsard.checkup.findings import Finding
 from acsard.checkup.motion import BoardReply
 from acsard.checkup.procedure import AGAIN, MOST
 from acsard.checkup.restarts import (
@@ -19,7 +21,7 @@ from acsard.core.config.settings import Config
 from acsard.core.link.board_status import IDENTITY
 from acsard.core.link.checked_line import Reading
 from tests.each import each
-from tests.unit.checkup_robots import MS, Checked, Robot
+from tests.unit.checkup_robots import MS, Checked, Nobody, Robot
 
 NAME = IDENTITY + b"1 counts=3200"
 
@@ -118,6 +120,21 @@ def test_a_watchdog_that_restarts_the_whole_board_is_named() -> None:
     assert checked.failed == ["restarts"]
     assert "let that watchdog only stop the motors" in checked["restarts"].mend
     assert "sent nothing for" in checked["restarts"].text
+
+
+def test_a_board_that_restarts_once_in_each_part_ends_the_check_at_the_fifth() -> None:
+    robot, findings, parts = Robot(), list[Finding](), list[str]()
+
+    class Watches(Nobody):
+        def doing(self, text: str) -> None:
+            if text not in parts and "restarted" not in text:
+                parts.append(text)
+                if len(parts) > 1:  # in the first part, a board boots because the port opens
+                    robot.mcu.reset(robot.now_ns())
+
+    procedure.run(robot, Watches(), robot.config, findings.append, fast=True)
+    *_, found, rest = findings
+    assert (found.figure, rest.verdict) == (f"restarted, {MOST} times", "SKIPPED")
 
 
 def test_a_board_that_does_not_come_back_is_reported() -> None:
