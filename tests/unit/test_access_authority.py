@@ -121,6 +121,12 @@ def test_a_client_has_the_host_names_that_its_name_can_be_and_the_authority_perm
         assert authority.names_in(add(Path(where), name, [], 1)) == names
 
 
+def test_a_long_host_name_is_cut_to_the_64_characters_of_a_common_name(tmp_path: Path) -> None:
+    Authority.make(tmp_path, "acsard at " + "x" * 60, 1)
+    made = x509.load_pem_x509_certificate((tmp_path / "ca.pem").read_bytes())
+    assert made.subject.rfc4514_string() == "CN=acsard at " + "x" * 54
+
+
 def test_an_authority_whose_key_is_of_another_kind_is_refused(tmp_path: Path) -> None:
     Authority.make(tmp_path, "test", 1)
     other = ed25519.Ed25519PrivateKey.generate()

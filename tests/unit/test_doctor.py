@@ -39,6 +39,7 @@ from acsard.machine.examination import (
     compared,
     examine,
     gateway,
+    local,
     query_or_finding,
     reported,
     routers,
@@ -382,6 +383,35 @@ def test_a_router_a_gateway_and_a_daemon_are_looked_for_where_they_should_listen
         found = query_or_finding(replace(FILE, bus=bus), at)
         assert isinstance(found, Finding)
         assert found.code == code
+
+
+@pytest.mark.parametrize(
+    ("calibrated", "port", "warned"),
+    [(False, "/dev/null", True), (True, "/dev/null", False), (False, "sim", False)],
+)
+def test_a_real_robot_without_a_calibration_is_warned_of(
+    calibrated: bool, port: str, warned: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(examination, "computer", lambda *_: ())
+    std: Any = 0.01 if calibrated else "uncalibrated"
+    odometry = replace(FILE.odometry, wheel_separation_multiplier_std=std)
+    config = replace(FILE, odometry=odometry, mcu=McuConfig(port=port))
+    found = codes(local(config, Address("tcp/127.0.0.1:1", "acsar", ""), "", 1))
+    assert ("not_calibrated" in found) is warned
+
+
+@pytest.mark.parametrize(("vid", "found"), [(0x2341, []), (0xDEAD, ["port_unknown_board"])])
+def test_a_board_of_another_maker_is_named_with_those_that_are_known(
+    vid: int, found: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    two = [
+        SimpleNamespace(device=device, vid=number, pid=0x42, description="n/a")
+        for device, number in (("/dev/null", vid), ("/dev/zero", 0xBEEF))
+    ]
+    monkeypatch.setattr("serial.tools.list_ports.comports", lambda: two)
+    others = [one for one in serial_port("/dev/null", simulated=False) if "board" in one.code]
+    assert codes(others) == found
+    assert all("dead:0042" in one.text and "2341:0042" in one.text + one.mend for one in others)
 
 
 def test_a_setting_with_a_surprising_effect_is_a_warning_also_without_a_daemon() -> None:

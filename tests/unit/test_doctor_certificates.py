@@ -153,6 +153,10 @@ def test_a_key_that_the_group_or_others_may_read_is_named(mode: int, open_key: b
     assert found[-1] == "certificate_valid"
 
 
+def test_without_certificates_there_is_nothing_to_find() -> None:
+    assert list(certificates("")) == []
+
+
 def expiring(fleet: Path) -> None:
     Authority.load(fleet).issue(fleet, "robot", ["localhost"], 9.9)
     (fleet / "ca-key.pem").unlink()

@@ -225,7 +225,8 @@ def test_acsard_gets_into_the_path_unless_there_is_one(machine: Path) -> None:
     assert linking() == []
     command = machine / COMMAND.relative_to("/")
     command.unlink()
-    command.parent.rmdir()
+    for place in (command.parent, command.parents[1]):
+        place.rmdir()
     (step,) = linking()
     step.do()
     assert command.readlink() == PROGRAM
@@ -246,12 +247,14 @@ def test_a_removal_says_what_it_leaves_and_a_purge_leaves_nothing(
     kept = [str(step) for step in steps if isinstance(step, Keep)]
     assert len(kept) == len(KEPT_BY_REMOVAL)
     assert all("; --purge removes it" in text for text in kept)
+    # The command of another installation stays.
+    (machine / COMMAND.relative_to("/")).symlink_to("/usr/bin/another")
     # The units are gone, so nothing is stopped.
     for step in uninstalling(purge=True):
         assert step in REMOVE_COMMANDS or isinstance(step, Remove)
         if isinstance(step, Remove):
             step.do()
-    assert files_in(machine) == set()
+    assert files_in(machine) == {str(COMMAND.relative_to("/"))}
 
 
 def test_the_files_are_those_of_deploy_with_the_port_of_a_real_robot() -> None:
