@@ -10,6 +10,7 @@ from msgspec import structs
 from acsard.checkup import motion
 from acsard.checkup.motion import SHORT_MEASUREMENT_S, BoardReply
 from acsard.checkup.motor_channels import Channel, Kind, encoder_finding, probe, run_up
+from acsard.checkup.outcomes import TimingFinding
 from acsard.core.config.settings import Config, McuConfig, SimConfig
 from acsard.core.link.checked_line import Reading
 from acsard.core.link.codec import Motors
@@ -121,7 +122,8 @@ def channel_of(motor: int, encoder: int, forth: float = 3.0, back: float = -3.0)
         (channel_of(0, 0, 2.9, -3.2), "off"),
         (structs.replace(channel_of(0, 0, 3.0, -2.75), unsure=0.05), "right"),
         (channel_of(0, 0, 4.0, -3.0), "size"), (channel_of(0, 0, 2.0, -2.0), "size"),
-        (channel_of(0, 0, -3.0, 3.0), "reversed"), (channel_of(0, 0, 3.0, 3.0), "no sign"),
+        (channel_of(0, 0, -3.0, 3.0), "reversed"), (channel_of(0, 0, -3.0, 0.8), "reversed"),
+        (channel_of(0, 0, 0.7, -0.7), "dead"), (channel_of(0, 0, 3.0, 3.0), "no sign"),
         (channel_of(0, 0, 0.0, 0.0), "dead"), (channel_of(0, 0, 3.0, 0.0), "one way"),
         (channel_of(0, 2), "other"), (channel_of(0, 2, -3.0, 3.0), "other"),
         (Channel(1, (3.0, 3.0, 0.0, 0.0), (-3.0, -3.0, 0.0, 0.0)), "several"),
@@ -135,6 +137,17 @@ def test_the_speeds_of_the_encoders_decide_the_kind_and_verdict_of_a_motor(
     finding = encoder_finding(MCU, channel)
     assert finding.verdict == {"right": "PASS", "off": "WARN"}.get(kind, "FAIL")
     assert bool(finding.mend) is (kind != "right")
+    assert structs.replace(channel, judged=False).kind == "late"
+
+
+@each(("speed", "beyond"), [(2.0, 1 / 3 - 0.25), (4.2, 0.4 - 0.25)])
+def test_a_late_computer_explains_a_small_error_of_the_speed_only(
+    speed: float, beyond: float
+) -> None:
+    """A wrong time in a measurement of 0.2 s is a wrong speed."""
+    found = encoder_finding(MCU, channel_of(0, 0, speed, -speed))
+    assert isinstance(found, TimingFinding)
+    assert found.margin_s == pytest.approx(0.4 * beyond)
 
 
 @FOUR_AND_TWO
