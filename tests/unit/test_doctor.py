@@ -45,7 +45,14 @@ from acsard.machine.examination import (
     routers,
 )
 from acsard.machine.finding import Finding
-from acsard.machine.local_findings import scheduling, serial_port, slowness, unused_version
+from acsard.machine.local_findings import (
+    clock_year,
+    computer,
+    scheduling,
+    serial_port,
+    slowness,
+    unused_version,
+)
 from acsard.machine.serial_ports import BOARDS
 from tests.unit.kernel_files import COUNT, HWMON, POLICY, QUIET, write
 
@@ -74,6 +81,8 @@ def test_a_reason_of_two_reports_is_printed_once_where_it_is_not_ok() -> None:
         Finding("serial link", "received_nothing", "failure", "down: nothing came", "check"),
         Finding("recording", "", "ok", "on"),
     ]
+    both = [row(name, 0, "sound", code="routers_connected") for name in ("bus", "routers")]
+    assert [one.subject for one in reported(tuple(both))] == ["bus", "routers"]
     (alone,) = reported((waits,))
     assert (alone.subject, alone.code) == ("mode", "received_nothing")
 
@@ -424,6 +433,25 @@ def test_a_setting_with_a_surprising_effect_is_a_warning_also_without_a_daemon()
     assert doubtful.level == "warning"
     assert "port_missing" in codes(found)
     assert "port_simulated" not in codes(found)
+
+
+@pytest.mark.parametrize(("year", "code"), [(1970, "clock_wrong"), (2026, "clock_right")])
+def test_a_computer_without_a_clock_starts_long_ago(
+    year: int, code: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    wall_ns = (year - 1970) * 31_557_600 * 10**9 + 10**15
+    monkeypatch.setattr(clock, "now", lambda: SimpleNamespace(wall_ns=wall_ns))
+    (found,) = clock_year()
+    assert found.code == code
+    assert str(year) in found.text
+
+
+@pytest.mark.parametrize("pid", [None, os.getpid()])
+@pytest.mark.parametrize("wanted", [True, False])
+def test_the_computer_is_examined_for_the_daemon_that_runs(wanted: bool, pid: int | None) -> None:
+    found, expected = [*computer(wanted, pid)], [*scheduling(wanted, pid)]
+    assert expected[0] in found
+    assert found[-1].subject == "computer"
 
 
 def test_without_real_time_in_the_configuration_no_warning_is_given() -> None:

@@ -7,7 +7,7 @@ import os
 import shutil
 import subprocess
 import sys
-from importlib.metadata import Distribution
+from importlib.metadata import Distribution, PackageNotFoundError
 from pathlib import Path
 
 import msgspec
@@ -220,6 +220,30 @@ def test_a_copy_waits_for_the_disk_also_if_the_program_sync_cannot_wait_for_one_
     versions.copy(home)
     assert (tmp_path / "asked").read_text().startswith(f"--file-system {home}/")
     assert synced == ["all disks"] * (not succeeds)
+
+
+@pytest.mark.parametrize(
+    ("missing", "error"), [("other", "the library other is missing in"), ("windows", "")]
+)
+def test_a_library_may_be_missing_only_if_another_system_needs_it(
+    missing: str, error: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    installed(tmp_path, "acsard")
+    metadata = tmp_path / "acsard-1.dist-info" / "METADATA"
+    needs = "Requires-Dist: other\nRequires-Dist: windows; sys_platform == 'win32'\n"
+    metadata.write_text(f"{metadata.read_text()}{needs}")
+
+    def distribution(name: str) -> Distribution:
+        if name in (missing, "windows"):
+            raise PackageNotFoundError(name)
+        return Distribution.at(tmp_path / "acsard-1.dist-info")
+
+    monkeypatch.setattr(versions, "distribution", distribution)
+    if error:
+        with pytest.raises(MendableError, match=error):
+            versions.closure()
+    else:
+        assert len(versions.closure()) == 2
 
 
 def test_a_full_disk_leaves_no_part(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
