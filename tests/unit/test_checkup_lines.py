@@ -11,7 +11,15 @@ from typing import Any
 import pytest
 from msgspec import structs
 
-from acsard.checkup import damage, dialect, encoder_counts, line_loss, motion, watchdog
+from acsard.checkup import (
+    damage,
+    dialect,
+    encoder_counts,
+    line_loss,
+    motion,
+    reply_times,
+    watchdog,
+)
 from acsard.checkup.board import Board
 from acsard.checkup.findings import StoppedError
 from acsard.checkup.motion import SPEED, BoardReply
@@ -182,6 +190,12 @@ def test_replies_that_come_late_are_no_reports_of_a_clock_of_the_board() -> None
         dialect.rate(board)
         assert not board.own_clock
         assert dialect.trip(board).code == "round_trip_slow"
+
+
+def test_too_few_replies_show_no_times() -> None:
+    with Seldom(0.25).board() as board:
+        board.paced = True
+        assert reply_times.finding(board) is None
 
 
 def test_a_board_that_falls_silent_has_no_round_trip() -> None:
