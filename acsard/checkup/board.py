@@ -442,10 +442,6 @@ class Board:
 
     # Standing still
 
-    def turning(self) -> list[int]:
-        last = self.replies[-1].motors if self.replies else self.zero
-        return motion.moving(last, motion.STANDING_SPEED)
-
     def stop_motors(self) -> None:
         """Send zeros until all motors stand still.
 

@@ -87,8 +87,6 @@ Keys = Mapping[str, object]  # values by dotted key, such as "mcu.port"
 
 def _require_writable(place: Path) -> None:
     # Raises `ValueError`.
-    if not place.is_file():
-        raise ValueError("it is not a regular file")
     # Check the mode bits too, because root may write every file, and because replacing a file needs
     # no permission to write to the file itself.
     if not (os.access(place, os.W_OK) and place.stat().st_mode & 0o222):
@@ -159,6 +157,9 @@ def _changed(
     file: Path, keys: Keys | Callable[[Config], Keys], new: bool
 ) -> tuple[Path, str, Keys]:
     place = real_path(file, new)
+    # Reading a pipe might never end, and a file in the place of a device would remove the device.
+    if place.exists() and not place.is_file():
+        raise ValueError("it is not a regular file")
     # `read_text` would lose CRLF line ends.
     text = "" if new and not place.exists() else _decoded(read(place))
     changes = keys(parse(text.encode())) if callable(keys) else keys

@@ -24,5 +24,4 @@ def finding(code: Code, **values: object) -> Finding:
 
 
 def about(subject: str, why: Reason) -> Finding:
-    mend = "" if why.level == "ok" else why.advice
-    return Finding(subject, why.code, why.level, why.text, mend)
+    return Finding(subject, why.code, why.level, why.text, why.advice)

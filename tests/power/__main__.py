@@ -1,7 +1,7 @@
 """Measures which faults of the product the tests notice.
 
     python -m tests.power mutants [--safety] [--only PATH [PATH ...]] [--tests PATH [PATH ...]]
-                                  [--sample N] [--seed 1] [--minutes M] [--jobs 2]
+                                  [--sample N] [--seed 1] [--minutes M] [--seconds 6] [--jobs 2]
 
 A mutant has one changed, swapped or dropped piece of the syntax. A whole number above 20 changes by
 a quarter, because `499` for `500` says nothing about a test. An index and a smaller number change
@@ -11,8 +11,8 @@ All mutants are tried, or a sample, of the modules whose path contains a PATH of
 `--safety` of those in `SAFETY`. All tests that run in this process take part (`TESTS` in
 `trials.py`), or those of `--tests`. Each mutant that no test noticed is printed, with the reason if
 `equivalent.py` says that no test can notice it. `not noticed` means that no test failed in 6 s of
-tests, the fastest first; `not reached`, that none executes it. The exit status is 1 if the tests
-noticed less than 98 %.
+tests (`--seconds`), the fastest first; `not reached`, that none executes it. The exit status is 1
+if the tests noticed less than 98 %.
 
 A clone remembers which test noticed a mutant (`.pytest_cache/power/noticed.json`). That test runs
 first the next time, and the program prints LOST for a mutant that was noticed once and is not now:
@@ -120,7 +120,7 @@ class Run:
         with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder:
             ignored = shutil.ignore_patterns(".*", "__pycache__")
             shutil.copytree(ROOT, folder, ignore=ignored, dirs_exist_ok=True)
-            Trials(Path(folder), self.asked.tests, work).run()
+            Trials(Path(folder), self.asked.tests, self.asked.seconds, work).run()
         seen = self.verdicts
         holes = [n for n, v in seen.items() if v in (NOBODY, UNREACHED) and n not in EQUIVALENT]
         noticed = sum(verdict not in (NOBODY, UNREACHED, UNDECIDED) for verdict in seen.values())
@@ -162,6 +162,7 @@ def main() -> int:
     parser.add_argument("--sample", type=int, help="how many mutants")
     parser.add_argument("--seed", type=int, default=1, help="which mutants")
     parser.add_argument("--minutes", type=float, default=1e9, help="start nothing after this time")
+    parser.add_argument("--seconds", type=float, default=6.0, help="of tests for each mutant")
     parser.add_argument("--jobs", type=int, default=2, help="how many processes")
     asked = parser.parse_args()
     for stream in (sys.stdout, sys.stderr):  # into a file too

@@ -38,11 +38,11 @@ from typing import NamedTuple
 import pytest
 from hypothesis import Phase, settings
 
+from tests.conftest import ANY_SPEED
+
 TESTS = ("tests/unit", "tests/scenarios", "tests/simulate", "tests/test_*.py")
 PYTEST = ["-n", "0", "-s", "-qq", "--disable-warnings", "-p", "no:cacheprovider"]
 PYTEST += ["--hypothesis-seed=0", "--timeout", "90"]
-MOST_SECONDS = 6.0
-"""CPU seconds after which a trial begins no further test."""
 PARTS = 60
 """The measurement is stored after each of this many parts of the tests."""
 MOST_FILES = 12
@@ -192,8 +192,14 @@ def codes(code: CodeType) -> Iterator[CodeType]:
 class Trials:
     """A pytest plugin that makes trials instead of running each collected test once."""
 
-    def __init__(self, root: Path, tests: Sequence[str], work: Callable[[Trials], None]) -> None:
-        """Store `work`, which `run` calls when the tests are collected."""
+    def __init__(
+        self, root: Path, tests: Sequence[str], seconds: float, work: Callable[[Trials], None]
+    ) -> None:
+        """Store `work`, which `run` calls when the tests are collected.
+
+        A trial begins no further test after this many CPU seconds.
+        """
+        self.seconds = seconds
         self.failed: set[str] = set()
         self.items: dict[str, pytest.Item] = {}
         self.fails: Callable[[str], None] = self.failed.add
@@ -215,6 +221,7 @@ class Trials:
 
     def run(self) -> None:
         """Collect the tests, and call `work`."""
+        os.environ[ANY_SPEED] = "1"  # the recorded lines take time
         tests = [path for name in self._tests for path in sorted(self._root.glob(name))]
         if pytest.main([*PYTEST, *map(str, tests)], [self]) != 0:
             raise RuntimeError("the tests cannot be collected")
@@ -417,7 +424,7 @@ class Trials:
             Planted({trial.path: ast.parse(trial.text())})
             files = sorted({test.partition("::")[0] for test in tests})
             return int(pytest.main([*PYTEST, *files], [_Afresh(self, tests)]))
-        self.until = time.process_time() + MOST_SECONDS
+        self.until = time.process_time() + self.seconds
         for _ in self.run_tests(tests):
             pass
         return 0
@@ -477,7 +484,7 @@ class _Afresh:
     def pytest_runtestloop(self, session: pytest.Session) -> bool:
         self._trials.items = {item.nodeid: item for item in session.items}
         tests = [test for test in self._tests if test in self._trials.items]
-        self._trials.until = time.process_time() + MOST_SECONDS
+        self._trials.until = time.process_time() + self._trials.seconds
         for _ in self._trials.run_tests(tests):
             pass
         return True

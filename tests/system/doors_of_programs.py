@@ -204,7 +204,7 @@ class CommandLine(OfClient):
         words = ("drive", "--linear", "0.2", "--config", str(self.robot.daemon.config))
         with at_terminal(self.robot.where, *words, term=SCREEN) as (terminal, drive):
             until(lambda: "as teleop" in terminal.screen, 10.0, "the screen")
-            with key_held(terminal, "i"):
+            with key_held(terminal, "i", lambda: (self.bus.state()["linear"] or 0.0) > 0.0):
                 self._program = drive
                 yield
             drive.signal(signal.SIGCONT)

@@ -12,7 +12,8 @@ import subprocess
 import sys
 import termios
 import threading
-from collections.abc import Iterator
+import time
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -79,13 +80,24 @@ class Terminal:
 
 
 @contextmanager
-def key_held(terminal: Terminal, key: str) -> Iterator[None]:
-    """Hold a key down while the body runs. The key repeats 20 times a second."""
+def key_held(
+    terminal: Terminal, key: str, drives: Callable[[], bool] = lambda: True
+) -> Iterator[None]:
+    """Hold a key down while the body runs. The key repeats 20 times a second.
+
+    A computer that is too busy may end a ride before it `drives`. The person then lets go for a
+    second.
+    """
     released = threading.Event()
 
     def repeat() -> None:
+        since, driven = time.monotonic(), False
         while not released.wait(0.05):
             terminal.press(key)
+            driven = driven or drives()
+            if not driven and time.monotonic() > since + 3.0:
+                released.wait(1.0)
+                since = time.monotonic()
 
     thread = threading.Thread(target=repeat)
     thread.start()

@@ -70,6 +70,9 @@ def test_a_flood_costs_no_periods_and_no_memory_and_delays_neither_a_stop_nor_it
         rest = applied.find(
             lambda step: step["twist"]["linear"]["x"] == 0.0, 5.0, "at rest", after=ended
         ).at
+        # On a busy machine, these may be the zeros of a link that was lost, and comes back.
+        mode = "stopped" if stopped else "ready"
+        until(lambda: bus.state()["mode"] == mode, 2.0, mode)
         after, grown = bus.state(), resident_kb(daemon.pid) - memory
         waited = kept_waiting(daemon.pid) - waited
     periods = Periods.between(before, after)
@@ -82,7 +85,6 @@ def test_a_flood_costs_no_periods_and_no_memory_and_delays_neither_a_stop_nor_it
     assert grown < 10_000
     # No backlog drives the robot on: the timeout of the last command, and a ramp of 0.2 s.
     assert rest - ended < 0.25 + 0.2 + 0.2 + waited + lost(ended, rest)
-    assert after["mode"] == ("stopped" if stopped else "ready")
     assert "Traceback" not in daemon.stderr
 
 

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 
+from tests.system.bystander import lost
 from tests.system.harness import (
     Bus,
     Daemon,
@@ -57,11 +58,11 @@ def is_even(periods: Periods, waited: float, up: bool) -> None:
     """Check that the number of sent lines is within 1 % of the rate.
 
     One line more at either end is allowed, and fewer lines for the time without a core. The
-    counters must explain each period without a line, unless the link was lost.
+    counters must explain each period without a line. A link that was lost may have some.
     """
     least, most = periods.elapsed * 0.99 - 1, periods.elapsed * 1.01 + 1
-    assert least - waited / TICK_S <= periods.sent <= most
-    # A link that was lost may have periods without a line.
+    assert periods.sent <= most
+    assert least - waited / TICK_S <= periods.sent or not up
     assert periods.are_all_accounted_for() or not up
 
 
@@ -109,5 +110,6 @@ def test_a_sender_that_repeats_its_speed_has_the_lines_of_the_periods(tmp_path: 
     )
     assert len(times) <= 1.01 * (ended - begun) / TICK_S + 1
     assert len(times) >= 0.97 * (ended - begun - waited) / TICK_S - 1
-    # The kernel may let the daemon wait for a core, and each wait may move some lines.
-    assert off <= len(times) / 10 + waited / 0.002
+    # Each wait of the daemon for a core may move some lines, and so may each wait of the kernel's
+    # thread for the pty, which has no priority.
+    assert off <= len(times) / 10 + (waited + lost(begun, ended)) / 0.002

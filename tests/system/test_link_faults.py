@@ -89,7 +89,8 @@ def test_a_board_that_stops_reading_and_answering_is_sent_few_drive_lines_then_z
         with peer.deaf():
             begun, known = time.monotonic(), len(peer.lines)
             until(lambda: time.monotonic() > begun + 1.0, 5.0, "a second")
-            end = time.monotonic()
+        until(lambda: len(peer.lines) > known, 5.0, "it reads again")
+        end = peer.lines[known].at
         until(lambda: peer.lines[-1].at > end + 0.005, 5.0, "it has read what waited")
         lines = [entry.line for entry in peer.lines[known:] if entry.at < end + 0.005]
     drive = [line for line in lines if line != ZERO_LINE]

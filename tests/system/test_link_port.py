@@ -165,8 +165,10 @@ async def test_a_released_port_is_closed_with_zeros_and_opened_again(line: Line)
         assert not port.is_open, "the other program still has it"
         close(other, wait_s=1.0)
         other.close()
-        await asyncio.sleep(0.5)
-        assert (port.is_open, port.opened) == (True, 2)
+        async with asyncio.timeout(5.0):
+            while not port.is_open:
+                await asyncio.sleep(0.01)
+        assert port.opened == 2
         keeper.cancel()
 
 

@@ -99,7 +99,8 @@ def test_a_second_daemon_on_the_port_ends_with_75_and_names_the_owner(
             second = finish(acsard("run", "--config", str(path)), tmp_path)
             peer.await_lines(10)
             lines = peer.session.raw_lines()[count:]
-            assert bus.state()["mode"] == "driving"
+            # On a busy machine, the link may have been lost for a moment.
+            until(lambda: bus.state()["mode"] == "driving", 5.0, "it drives on")
     print(f"second daemon on the port: exit {second.code} after {second.seconds:.2f} s")
     assert second.code == 75
     assert f"process {first.pid}" in second.err

@@ -132,8 +132,9 @@ def test_the_authority_signs_certificates_and_nothing_below_it_does(made: Path) 
     authority.verify_directly_issued_by(authority)
     basic = authority.extensions.get_extension_for_class(x509.BasicConstraints)
     assert (basic.critical, basic.value.ca, basic.value.path_length) == (True, True, 0)
-    usage = authority.extensions.get_extension_for_class(x509.KeyUsage).value
-    assert (usage.key_cert_sign, usage.digital_signature) == (True, False)
+    usage = authority.extensions.get_extension_for_class(x509.KeyUsage)
+    assert (usage.critical, usage.value.key_cert_sign) == (True, True)
+    assert not usage.value.digital_signature
     now, both = (
         datetime.now(UTC),
         {ExtendedKeyUsageOID.SERVER_AUTH, ExtendedKeyUsageOID.CLIENT_AUTH},
@@ -144,8 +145,9 @@ def test_the_authority_signs_certificates_and_nothing_below_it_does(made: Path) 
         assert certificate(made / place, "ca.pem") == authority
         assert common_name(issued.subject) == name
         assert not extensions.get_extension_for_class(x509.BasicConstraints).value.ca
-        usage = extensions.get_extension_for_class(x509.KeyUsage).value
-        assert (usage.key_cert_sign, usage.digital_signature) == (False, True)
+        own = extensions.get_extension_for_class(x509.KeyUsage)
+        assert (own.value.key_cert_sign, own.value.digital_signature) == (False, True)
+        assert own.critical
         # It serves at both ends of a link, from a little before now for the days asked.
         assert set(extensions.get_extension_for_class(x509.ExtendedKeyUsage).value) == both
         assert now - timedelta(hours=2) < issued.not_valid_before_utc < now

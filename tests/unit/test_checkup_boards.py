@@ -8,13 +8,14 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 import pytest
 from msgspec import structs
 
-from acsard.checkup import inputs
+from acsard.checkup import inputs, procedure
 from acsard.checkup.findings import Finding, motor_name
 from acsard.core.config.motion_rules import top_wheel_speed
 from acsard.core.config.settings import (
@@ -206,6 +207,35 @@ def lines(finding: Finding) -> Iterator[str]:
 DAILY = ("motors", "hardware", "two_wheels", "course")
 
 
+def robots(page: str) -> Iterator[tuple[str, Robot, bool]]:
+    """Yield the boards of a page: name, robot, and whether a person watches."""
+    for name, (faults, how, person) in BOARDS[page].items():
+        habit = HABITS[name] if page == "habits" else None
+        robot = Hobby(habit, *faults.split(), **how) if habit else Robot(*faults.split(), **how)
+        yield name, robot, person
+
+
+class Page:
+    """The text of a page, board by board."""
+
+    def __init__(self, page: str) -> None:
+        self._passes = page in ("good", "hardware")
+        self._first, self._passed = list[Finding](), set[str]()
+
+    def new(self, findings: list[Finding]) -> list[str]:
+        """Return what the page says about the next board."""
+        text = list[str]()
+        for finding in findings:
+            passed = finding.verdict == "PASS" and finding.name in self._passed
+            if not (finding in self._first or passed):
+                text += lines(finding)
+        if not self._first:
+            self._first = findings
+            if not self._passes:
+                self._passed = {found.name for found in findings if found.verdict == "PASS"}
+        return text
+
+
 @pytest.mark.parametrize(
     "page",
     [pytest.param(page, marks=() if page in DAILY else pytest.mark.slow) for page in BOARDS],
@@ -213,24 +243,42 @@ DAILY = ("motors", "hardware", "two_wheels", "course")
 def test_the_check_names_each_fault_and_nothing_else(
     page: str, approved: Callable[[Path, str], None]
 ) -> None:
-    text, first, passed = "", list[Finding](), set[str]()
-    for name, (faults, how, person) in BOARDS[page].items():
-        habit = HABITS[name] if page == "habits" else None
-        robot = Hobby(habit, *faults.split(), **how) if habit else Robot(*faults.split(), **how)
+    text, says = "", Page(page)
+    for name, robot, person in robots(page):
         checked = Checked(robot, person)
         assert not checked.left_turning
         sent = [line for line in robot.sent if b"x" not in line]
         top = max(3.0, top_wheel_speed(robot.config))
         assert max(float(speed) for line in sent for speed in SPEED.findall(line)) <= top
-        text += f"== {name}\n"
-        for finding in checked.findings:
-            if not (finding in first or (finding.verdict == "PASS" and finding.name in passed)):
-                text += "".join(f"{line}\n" for line in lines(finding))
+        text += "".join(f"{line}\n" for line in (f"== {name}", *says.new(checked.findings)))
         text += "".join(f"        {key} = {value!r}\n" for key, value in checked.changes.items())
-        first = first or checked.findings
-        if page not in ("good", "hardware"):
-            passed = {finding.name for finding in first if finding.verdict == "PASS"}
     approved(WORDS / f"checkup_{page}.txt", text)
+
+
+class Leaves(Nobody):
+    """An operator who ends the check when the first motor shall turn."""
+
+    def doing(self, text: str) -> None:
+        if "turns: briefly" in text:
+            raise KeyboardInterrupt
+
+
+@pytest.mark.parametrize("page", ["good", "lines", "losses", "habits", "firmware"])
+def test_the_steps_in_which_no_motor_turns_say_what_the_whole_check_says(page: str) -> None:
+    """The whole checks of these boards are slow."""
+    steps = procedure.STEPS[: procedure.STEPS.index("motors")]
+    texts = (WORDS / f"checkup_{page}.txt").read_text(encoding="utf-8").split("== ")[1:]
+    says = Page(page)
+    for (name, robot, _), text in zip(robots(page), texts, strict=True):
+        findings = list[Finding]()
+        with robot.faulty(), suppress(KeyboardInterrupt):
+            procedure.run(robot, Leaves(), robot.config, findings.append, fast=True)
+        assert {float(speed) for line in robot.sent for speed in SPEED.findall(line)} == {0.0}
+        # A finding has indented lines, and at the end of the board are the changes.
+        entries = re.split(r"\n(?! )", re.sub(r"\n +\w+\.\w+ = .*", "", text).rstrip())
+        told = [entry for entry in entries[1:] if entry[8:].startswith(steps)]
+        silent = [finding for finding in findings if finding.name in steps]
+        assert says.new(silent) == "\n".join(told).splitlines(), name
 
 
 @FOUR_AND_TWO

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import pytest
 
-from acsard.checkup import procedure
+from acsard.checkup import dialect, line_loss, procedure, reply_times
+from acsard.checkup.board import Board
 from acsard.checkup.findings import Finding
 from acsard.checkup.lateness import (
     MAX_LATENESS_S,
@@ -21,6 +24,7 @@ from tests.unit.checkup_robots import (
     Busy,
     Checked,
     Nobody,
+    Robot,
     Starved,
     check,
 )
@@ -66,6 +70,40 @@ def test_a_step_that_a_late_moment_spoilt_is_repeated() -> None:
         checked = Checked(computer("no_sample", late_s=0.45, every=9, until_s=2.5))
         assert names(checked) == set()
         assert [f.verdict for f in checked.findings] == [f.verdict for f in quiet.findings]
+
+
+def test_a_late_step_is_repeated_twice_and_all_of_them_eight_times() -> None:
+    parts = [""]
+
+    class Counts(Nobody):
+        def doing(self, text: str) -> None:
+            parts.append(text)
+
+    robot, findings = Busy("plain_only", late_s=0.15, every=5), list[Finding]()
+    with robot.faulty():
+        procedure.run(robot, Counts(), robot.config, findings.append, fast=True)
+    late = [finding.text for finding in findings if finding.figure == "not judged"]
+    assert late
+    assert all("ran the check up to 150 ms too late" in text for text in late)
+    series = "".join("r" if "runs again" in part else " " for part in parts).split()
+    assert max(series) == "r" * procedure.LATE_AGAIN
+    assert len("".join(series)) == procedure.LATE_MOST
+
+
+@each(
+    "step",
+    [dialect.trip, line_loss.finding, reply_times.finding, partial(dialect.comma, kind="late")],
+)
+def test_what_follows_from_a_step_that_was_late_is_not_judged(
+    step: Callable[[Board], Finding | None],
+) -> None:
+    with Robot("plain_only").board() as board:
+        assert not board.paced
+        board.lateness.record(0.2, board.now_s)
+        found = step(board)
+    assert found is not None
+    assert (found.figure, found.keys) == ("not judged", {})
+    assert "up to 200 ms too late" in found.text
 
 
 @pytest.mark.variations(5)

@@ -9,7 +9,8 @@ from msgspec import structs
 
 from acsard.checkup import motion
 from acsard.checkup.motion import SHORT_MEASUREMENT_S, BoardReply
-from acsard.checkup.motor_channels import Channel, Kind, encoder_finding, probe
+from acsard.checkup.motor_channels import Channel, Kind, encoder_finding, probe, run_up
+from acsard.checkup.outcomes import TimingFinding
 from acsard.core.config.settings import Config, McuConfig, SimConfig
 from acsard.core.link.checked_line import Reading
 from acsard.core.link.codec import Motors
@@ -50,7 +51,56 @@ def test_a_coarse_encoder_is_not_a_runaway_but_a_real_runaway_is_found(
     assert -10.0 < runaway[1] < -6.0
 
 
+@each("wrong", [60.0, -60.0])
+@each("place", [3, 20])
+def test_one_wrong_reply_is_no_runaway_in_either_direction(wrong: float, place: int) -> None:
+    series = course(3.0, 3200)
+    series[place] = structs.replace(series[place], motors=(0.0, wrong, 0.0, 0.0))
+    for n in range(1, len(series)):
+        assert motion.runaway(series[:n]) is None
+
+
+def test_the_trend_compares_the_last_half_second_with_the_one_before() -> None:
+    def trend(*speeds: float) -> float:
+        """Return the trend of motor b, whose speed changes each half second."""
+        series = [
+            BoardReply(0.5 * n + 0.02 * k - 0.01, (0.0, speed, 0.0, 0.0), b"")
+            for n, speed in enumerate(speeds)
+            for k in range(1, 26)
+        ]
+        now_s = 0.5 * len(speeds)
+        standing, own, *_ = motion.trend(series, (0.0,) * 4, now_s, 0.02)
+        assert standing == 1.0
+        return own
+
+    assert trend(0.0, 0.0, 3.0, 3.0) == pytest.approx(1.0)
+    assert trend(3.0, 3.0, 3.0, 2.7) == pytest.approx(0.9)
+    assert trend(3.0, 3.0, -2.7, -3.0) == pytest.approx(1.11, abs=0.01)
+    assert trend(3.0, 3.0, 3.0, 0.0) == trend(0.0, 0.0, 0.0, 3.0) == 1.0
+
+
 # Motors.
+
+
+@each(
+    ("lag", "fault", "speed", "at_most_s"),
+    [
+        (0.05, (), 3.0, 1.0),
+        # A wheel that still speeds up is waited for, and one that stays weak is not.
+        (1.5, (), 3.0, 7.0),
+        (0.05, ("bias=a:0.6",), 1.8, 2.6),
+        (0.05, ("stuck_encoder=a",), 0.0, 1.2),
+    ],
+)
+def test_a_motor_has_time_as_long_as_its_speed_rises(
+    lag: float, fault: tuple[str, ...], speed: float, at_most_s: float
+) -> None:
+    robot = Robot("plain_only", *fault, config=Config(sim=SimConfig(motor_time_constant=lag)))
+    with robot.board() as board:
+        began_s = board.now_s
+        (means, *_) = run_up(board, board.only([0]))
+        assert means == pytest.approx(speed, abs=0.35)
+        assert board.now_s - began_s < at_most_s
 
 
 MCU = McuConfig()
@@ -72,7 +122,8 @@ def channel_of(motor: int, encoder: int, forth: float = 3.0, back: float = -3.0)
         (channel_of(0, 0, 2.9, -3.2), "off"),
         (structs.replace(channel_of(0, 0, 3.0, -2.75), unsure=0.05), "right"),
         (channel_of(0, 0, 4.0, -3.0), "size"), (channel_of(0, 0, 2.0, -2.0), "size"),
-        (channel_of(0, 0, -3.0, 3.0), "reversed"), (channel_of(0, 0, 3.0, 3.0), "no sign"),
+        (channel_of(0, 0, -3.0, 3.0), "reversed"), (channel_of(0, 0, -3.0, 0.8), "reversed"),
+        (channel_of(0, 0, 0.7, -0.7), "dead"), (channel_of(0, 0, 3.0, 3.0), "no sign"),
         (channel_of(0, 0, 0.0, 0.0), "dead"), (channel_of(0, 0, 3.0, 0.0), "one way"),
         (channel_of(0, 2), "other"), (channel_of(0, 2, -3.0, 3.0), "other"),
         (Channel(1, (3.0, 3.0, 0.0, 0.0), (-3.0, -3.0, 0.0, 0.0)), "several"),
@@ -86,6 +137,17 @@ def test_the_speeds_of_the_encoders_decide_the_kind_and_verdict_of_a_motor(
     finding = encoder_finding(MCU, channel)
     assert finding.verdict == {"right": "PASS", "off": "WARN"}.get(kind, "FAIL")
     assert bool(finding.mend) is (kind != "right")
+    assert structs.replace(channel, judged=False).kind == "late"
+
+
+@each(("speed", "beyond"), [(2.0, 1 / 3 - 0.25), (4.2, 0.4 - 0.25)])
+def test_a_late_computer_explains_a_small_error_of_the_speed_only(
+    speed: float, beyond: float
+) -> None:
+    """A wrong time in a measurement of 0.2 s is a wrong speed."""
+    found = encoder_finding(MCU, channel_of(0, 0, speed, -speed))
+    assert isinstance(found, TimingFinding)
+    assert found.margin_s == pytest.approx(0.4 * beyond)
 
 
 @FOUR_AND_TWO

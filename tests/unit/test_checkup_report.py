@@ -39,6 +39,12 @@ def test_a_check_with_a_step_not_judged_or_not_tried_has_not_passed(
     assert report("sim", [RATE, *more], {}, "", "").passed is passed
 
 
+def test_a_port_on_which_no_board_answered_is_not_proposed() -> None:
+    nothing = [Finding("baud rate", "FAIL", "nothing received")]
+    assert checkup_report.changes(nothing, Config(), "/dev/one") == {}
+    assert not report("/dev/one", [Finding("baud rate", "PASS")], {}, "", "").passed
+
+
 def test_the_summary_counts_the_steps_not_judged_and_advises_to_repeat() -> None:
     late = [lateness.finding(name, 0.08) for name in ("watchdog", "lost lines")]
     lines = summary(report("sim", [RATE, *late], {}, "", ""), "acsard.toml").splitlines()

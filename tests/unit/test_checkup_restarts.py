@@ -6,6 +6,8 @@ from collections.abc import Sequence
 
 import pytest
 
+from acsard.checkup import procedure
+from acsard.checkup.findings import Finding
 from acsard.checkup.motion import BoardReply
 from acsard.checkup.procedure import AGAIN, MOST
 from acsard.checkup.restarts import (
@@ -19,7 +21,7 @@ from acsard.core.config.settings import Config
 from acsard.core.link.board_status import IDENTITY
 from acsard.core.link.checked_line import Reading
 from tests.each import each
-from tests.unit.checkup_robots import MS, Checked, Robot
+from tests.unit.checkup_robots import MS, Checked, Nobody, Robot
 
 NAME = IDENTITY + b"1 counts=3200"
 
@@ -120,6 +122,21 @@ def test_a_watchdog_that_restarts_the_whole_board_is_named() -> None:
     assert "sent nothing for" in checked["restarts"].text
 
 
+def test_a_board_that_restarts_once_in_each_part_ends_the_check_at_the_fifth() -> None:
+    robot, findings, parts = Robot(), list[Finding](), list[str]()
+
+    class Watches(Nobody):
+        def doing(self, text: str) -> None:
+            if text not in parts and "restarted" not in text:
+                parts.append(text)
+                if len(parts) > 1:  # in the first part, a board boots because the port opens
+                    robot.mcu.reset(robot.now_ns())
+
+    procedure.run(robot, Watches(), robot.config, findings.append, fast=True)
+    *_, found, rest = findings
+    assert (found.figure, rest.verdict) == ("restarted, 5 times", "SKIPPED")
+
+
 def test_a_board_that_does_not_come_back_is_reported() -> None:
     class Dies(Robot):
         dead = False
@@ -154,6 +171,29 @@ def test_the_boot_cause_that_the_board_states_decides_the_remedy(cause: str, men
     result = finding(Config().mcu, [restart])
     assert result.mend.startswith(mend)
     assert f"(reset={cause})" in result.text
+
+
+TURNED = (0.0, 3.0, 0.0, 0.0)
+
+
+@each(
+    ("code", "restarts"),
+    [
+        ("restarts_seen", [Restart("x", TURNED)]),
+        ("restarts_motors", [Restart("x", TURNED), Restart("x", TURNED)]),
+        ("restarts_seen", [Restart("x", TURNED), Restart("x")]),
+        ("restarts_silence", [Restart("x", silent_s=0.25), Restart("x", silent_s=0.5)]),
+        ("restarts_seen", [Restart("x", silent_s=0.24), Restart("x", silent_s=0.5)]),
+        ("restarts_watchdog", [Restart("x", silent_s=0.5, cause="watchdog")]),
+        # It restarts in each silence, so its watchdog restarts the whole board.
+        ("restarts_silence", [Restart("x", silent_s=0.5, cause="watchdog")] * 2),
+        ("restarts_supply", [Restart("x", TURNED, cause="brown-out"), Restart("x", cause="power")]),
+        ("restarts_seen", [Restart("x", cause="pin"), Restart("x", cause="power")]),
+    ],
+)
+def test_one_restart_proves_less_than_several(code: str, restarts: list[Restart]) -> None:
+    assert finding(Config().mcu, restarts).code == code
+    assert finding(Config().mcu, restarts, back=False).code == "restarts_gone"
 
 
 def reply(at_s: float, mcu_ms: int) -> BoardReply:

@@ -8,8 +8,8 @@ from collections.abc import Callable, Sequence
 import pytest
 from msgspec.structs import replace
 
-from acsard.checkup import dialect, lateness, procedure, reply_times, top_speed
-from acsard.checkup.findings import Finding, StoppedError
+from acsard.checkup import dialect, lateness, line_loss, procedure, reply_times, top_speed
+from acsard.checkup.findings import Finding, StoppedError, motor_name
 from acsard.checkup.motor_channels import Channel, channel, wheel_map
 from acsard.checkup.restarts import RestartedError
 from acsard.core.config.settings import Config, LimitsConfig, SimConfig
@@ -62,6 +62,9 @@ def test_the_speeds_up_to_that_of_the_limits_are_compared(
         assert max(map(abs, robot.mcu.vehicle.speeds)) < 0.1
         assert board.most_speed == 6.0
     assert found.code == code
+    if code == "top_speed_short":
+        for motor in range(len(board.letters)):
+            assert motor_name(board.mcu, motor) in found.text
     if code == "top_speed_overflow":
         assert "10.0 rad/s" in found.text
 
@@ -113,6 +116,18 @@ def test_a_runaway_is_judged_by_the_speed_of_the_step_until_the_motors_stand() -
         with pytest.raises(StoppedError) as end:
             top_speed.finding(board, [0], None, TOP, 0.05)
         assert "more than 30 rad/s" in end.value.finding.text
+
+
+@each(("gain", "code"), [(3.0, "runaway_along"), (-3.0, "runaway_against")])
+@each("speed", [3.0, -3.0])
+def test_a_runaway_goes_with_its_command_or_against_it(
+    gain: float, code: str, speed: float
+) -> None:
+    robot = Reported(lambda measured: gain * measured)
+    with robot.board() as board, pytest.raises(StoppedError) as end:
+        board.drive(board.only([1], speed), 1.0)
+    assert end.value.finding.code == code
+    assert "motor b" in end.value.finding.name + end.value.finding.text
 
 
 def test_a_restart_at_high_speed_leaves_the_high_bound_until_the_motors_stand() -> None:
@@ -200,6 +215,18 @@ def test_replies_behind_silences_come_in_bunches(block_s: float, every_s: float,
     assert found.code == code
     if code == "reply_times_bunched":
         assert float(found.figure.split("max ")[1].split()[0]) > 900 * block_s - 5
+
+
+@each(
+    ("block_s", "code"),
+    [(0.0, "lost_lines_none"), (0.075, "lost_lines_none"), (0.12, "lost_lines_late")],
+)
+def test_a_silence_that_the_daemon_takes_for_a_lost_link_is_named(
+    block_s: float, code: str
+) -> None:
+    with Blocking(block_s, 0.5).board() as board:
+        board.paced, board.gap_s = True, 0.01
+        assert line_loss.finding(board).code == code
 
 
 def answered(wheels: Sequence[str | None], **faulty: int) -> list[Channel]:

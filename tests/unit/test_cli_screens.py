@@ -239,6 +239,8 @@ def test_any_state_fits_any_terminal_and_is_printable(
     ("later", "earlier", "seconds", "text"),
     [
         (300, 200, 1.0, "100.0/s"),
+        (9999, 0, 10.0, "999.9/s"),
+        (10_000, 0, 10.0, " 1000/s"),
         (20_000, 0, 2.0, "10000/s"),
         (10, 200, 1.0, "    -/s"),  # the daemon restarted
         (300, 200, 0.0, "    -/s"),  # there is only one state

@@ -24,7 +24,7 @@ from acsard.core.incoming.commands import Arrival, Receiver
 from acsard.core.incoming.queries import Queries, Query
 from acsard.core.messages import schema
 from acsard.core.messages.encodings import Decoder, encode
-from acsard.core.messages.refusals import MAX_COMMAND_BYTES
+from acsard.core.messages.refusals import BUSY_ENCODING, MAX_COMMAND_BYTES
 from acsard.core.messages.schema import (
     Beat,
     ReplyData,
@@ -235,6 +235,57 @@ def test_an_unknown_key_is_reported_as_the_only_reason(session: Session, name: s
     assert f"acsard/acsar/{name}" in message
     assert "did you mean" in message
     assert "daemon" not in message
+
+
+def error(text: str, encoding: str = "text/plain") -> SimpleNamespace:
+    """Return an error reply of Zenoh or of the daemon."""
+    payload = SimpleNamespace(to_bytes=text.encode)
+    return SimpleNamespace(ok=None, err=SimpleNamespace(payload=payload, encoding=encoding))
+
+
+BUSY = error("busy", BUSY_ENCODING)
+STUCK = (NoAnswerError, "within .* the daemon or the network is stuck")
+REFUSED = (ReplyError, "no: because")
+
+
+@each(
+    ("name", "replies", "asked", "raised"),
+    [
+        ("odom", [error("Timeout")], 1, STUCK),
+        ("srv/stop", [error("Timeout")], 1, STUCK),
+        ("odom", [error("no: because")], 1, REFUSED),
+        # A query that a busy daemon refused is repeated, and a call is not.
+        ("odom", [BUSY, BUSY, error("no: because")], 3, REFUSED),
+        ("srv/stop", [BUSY, error("no: because")], 1, (ReplyError, "srv/stop: busy")),
+    ],
+)
+def test_an_error_reply_is_repeated_if_the_daemon_is_busy_and_named_otherwise(
+    name: str, replies: list[Any], asked: int, raised: tuple[type[Exception], str]
+) -> None:
+    session, left = Session("0123456789abcdef"), iter(replies)
+    vars(session)["get"] = lambda *_, **__: [next(left)]
+    kind, words = raised
+    with pytest.raises(kind, match=words):
+        client_of(session).reply(name)
+    assert len(list(left)) == len(replies) - asked
+
+
+@each(
+    ("identity", "words"),
+    [
+        (ClientIdentity("", "anna", "anna/1", "acsar"), "no daemon answers as 'acsar'"),
+        (ClientIdentity("viewer", "anna", "anna/1", "acsar"), "anna has the role viewer"),
+    ],
+)
+def test_over_tls_a_silence_is_explained_by_the_role_of_the_certificate(
+    identity: ClientIdentity, words: str
+) -> None:
+    ours = client_of(Session("0123456789abcdef"))
+    ours.where = ours.where._replace(tls="certificates")
+    vars(ours)["whoami"] = lambda: identity
+    with pytest.raises((NoAnswerError, client.NotPermittedError), match=words) as raised:
+        ours.reply("config")
+    assert isinstance(raised.value, NoAnswerError) is (identity.role == "")
 
 
 def test_a_call_above_the_size_limit_is_refused_in_the_daemon_s_words(

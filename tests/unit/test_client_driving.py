@@ -237,6 +237,16 @@ def test_a_drive_that_is_not_followed_ends_with_the_reason_and_a_zero(
     assert (world.sent[-1], world.subscribed) == (0.0, False)
 
 
+def test_a_stop_while_the_last_zeros_are_sent_is_named() -> None:
+    usual = World(followed)
+    usual.drive(1.0)
+    world = World(after(usual.passed - 0.15, STOPPED))
+    with pytest.raises(NotDrivenError, match="stopped by request"):
+        world.drive(1.0)
+    assert world.sent[-1] == 0.0
+    assert world.passed <= usual.passed + 0.1
+
+
 @each(
     ("trouble", "begins", "lasts", "seconds"),
     [

@@ -51,6 +51,8 @@ def test_a_missing_permission_is_reported_with_the_role_that_it_needs() -> None:
     assert viewer.lacks("srv/stop") == viewer.lacks("state") == ""
     assert ClientIdentity("maintainer", "", "x").lacks("config") == ""
     assert ClientIdentity("", "", "x").lacks("config") == ""
+    words = "you connect without a certificate and have the role operator: "
+    assert ClientIdentity("operator", "", "x").describe().startswith(words)
     assert viewer.lacks("json/no/such/key") == ""
 
 

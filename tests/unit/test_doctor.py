@@ -11,6 +11,7 @@ import socket
 import stat
 import subprocess
 import sys
+import time
 from collections.abc import Iterable
 from contextlib import nullcontext
 from pathlib import Path
@@ -30,7 +31,7 @@ from acsard.daemon.serial.device import refusal
 from acsard.host import clock, real_time
 from acsard.host.errors import CertificateError, NoAnswerError
 from acsard.host.kernel_counters import Kernel
-from acsard.machine import examination, versions
+from acsard.machine import examination, local_findings, versions
 from acsard.machine.authority import Authority
 from acsard.machine.examination import (
     Running,
@@ -38,14 +39,22 @@ from acsard.machine.examination import (
     compared,
     examine,
     gateway,
+    local,
     query_or_finding,
     reported,
     routers,
 )
 from acsard.machine.finding import Finding
-from acsard.machine.local_findings import scheduling, serial_port, slowness, unused_version
+from acsard.machine.local_findings import (
+    clock_year,
+    computer,
+    scheduling,
+    serial_port,
+    slowness,
+    unused_version,
+)
 from acsard.machine.serial_ports import BOARDS
-from tests.unit.kernel_files import HWMON, POLICY, QUIET, write
+from tests.unit.kernel_files import COUNT, HWMON, POLICY, QUIET, write
 
 INFO = Info("acsar", "1.2", 77, "/dev/pts/3", False, 100.0, [], [])
 FILE = Config()
@@ -72,6 +81,8 @@ def test_a_reason_of_two_reports_is_printed_once_where_it_is_not_ok() -> None:
         Finding("serial link", "received_nothing", "failure", "down: nothing came", "check"),
         Finding("recording", "", "ok", "on"),
     ]
+    both = [row(name, 0, "sound", code="routers_connected") for name in ("bus", "routers")]
+    assert [one.subject for one in reported(tuple(both))] == ["bus", "routers"]
     (alone,) = reported((waits,))
     assert (alone.subject, alone.code) == ("mode", "received_nothing")
 
@@ -132,7 +143,7 @@ def test_what_does_not_answer_has_its_code(
 
 
 def test_the_file_s_values_are_ok() -> None:
-    assert [finding.level for finding in compared(FILE, FILE)] == ["ok"]
+    assert [(one.code, one.level) for one in compared(FILE, FILE)] == [("configuration_same", "ok")]
 
 
 def test_values_of_command_line_options_are_no_warning() -> None:
@@ -149,6 +160,7 @@ def test_values_of_command_line_options_are_no_warning() -> None:
         (["127.0.0.1"], "tcp/127.0.0.1:{}", ["bus"]),  # the router listens on this one, too
         ([], "tcp/127.0.0.1:{}", []),
         ([], "tcp/router.local:{}", ["bus"]),
+        ([], "tls/router.local:{}", []),
     ],
 )
 def test_a_router_without_tls_is_warned_of_unless_only_this_machine_reaches_it(
@@ -175,6 +187,19 @@ class OfAnotherRobot:
         raise NoAnswerError(key)
 
 
+@pytest.mark.parametrize(("config", "code"), [(FILE, ""), (None, "configuration_secret")])
+def test_a_daemon_with_the_simulator_has_no_port_and_may_keep_its_values_secret(
+    config: Config | None, code: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert FILE.mcu.simulated
+    running = Running(INFO, config, (), "")
+    monkeypatch.setattr(examination, "query_or_finding", lambda *_: running)
+    monkeypatch.setattr(examination, "computer", lambda *_: ())
+    found = codes(examine("x", b"", {}))
+    assert "port_simulated" not in found
+    assert found[-1:] == [code] or not code
+
+
 @pytest.mark.parametrize(("robot", "judged"), [("acsar", True), ("robot1", False)])
 def test_a_robot_is_judged_by_its_own_file_only(
     robot: str, judged: bool, monkeypatch: pytest.MonkeyPatch
@@ -195,6 +220,21 @@ def test_values_that_were_set_and_sources_that_only_the_file_has_are_a_warning()
     assert "limits.linear_speed = 0.4, not " in finding.text
     assert f"commands.sources.{FILE.commands.sources[0].name}.priority" in finding.text
     assert "`acsard set`" in finding.mend
+
+
+@pytest.mark.parametrize(("count", "rest"), [(6, ""), (8, "and 2 more")])
+def test_six_values_that_differ_are_named_and_the_number_of_the_others(
+    count: int, rest: str
+) -> None:
+    names = [
+        "linear_speed", "angular_speed", "linear_acceleration", "angular_acceleration",
+        "linear_deceleration", "angular_deceleration", "linear_stop_deceleration",
+        "angular_stop_deceleration",
+    ][:count]  # fmt: skip
+    limits = replace(FILE.limits, **dict.fromkeys(names, 0.123))
+    (finding,) = compared(replace(FILE, limits=limits), FILE)
+    assert finding.text.count("limits.") == 6
+    assert finding.text.endswith(rest)
 
 
 @pytest.mark.parametrize(
@@ -275,14 +315,20 @@ def test_a_device_file_without_a_device_is_named_by_doctor_and_daemon(tmp_path: 
     assert next(serial_port("/dev/null", simulated=False)).level == "ok"
 
 
-def test_a_program_that_uses_the_port_in_place_of_the_daemon_is_a_failure() -> None:
+@pytest.mark.parametrize(
+    ("name", "code", "level"),
+    [("other", "port_held", "failure"), ("acsard", "port_held_by_acsard", "ok")],
+)
+def test_a_program_that_uses_the_port_is_a_failure_unless_it_is_acsard(
+    name: str, code: str, level: str, tmp_path: Path
+) -> None:
     board, port = pty.openpty()
     path = os.ttyname(port)
     opened = f"os.open({path!r}, os.O_RDWR | os.O_NOCTTY)"
-    code = f"import os, sys; {opened}; print(flush=True); sys.stdin.read()"
-    with subprocess.Popen(
-        [sys.executable, "-c", code], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
-    ) as other:
+    program = f"import os, sys; {opened}; print(flush=True); sys.stdin.read()"
+    (tmp_path / name).symlink_to(os.path.realpath(sys.executable))
+    words, pipe = [str(tmp_path / name), "-I", "-S", "-c", program], subprocess.PIPE
+    with subprocess.Popen(words, stdin=pipe, stdout=pipe, text=True) as other:
         assert other.stdout is not None
         other.stdout.readline()
         findings = list(serial_port(path, simulated=False))
@@ -291,8 +337,9 @@ def test_a_program_that_uses_the_port_in_place_of_the_daemon_is_a_failure() -> N
     for end in (board, port):
         os.close(end)
     (used,) = [finding for finding in findings if f"(pid {other.pid})" in finding.text]
-    assert used.level == "failure"
-    assert used.mend == "end that program, unless it belongs to your simulator of the board"
+    assert (used.code, used.level) == (code, level)
+    advice = "end that program, unless it belongs to your simulator of the board"
+    assert used.mend == ("" if level == "ok" else advice)
 
 
 def codes(findings: Iterable[Finding]) -> list[str]:
@@ -347,6 +394,35 @@ def test_a_router_a_gateway_and_a_daemon_are_looked_for_where_they_should_listen
         assert found.code == code
 
 
+@pytest.mark.parametrize(
+    ("calibrated", "port", "warned"),
+    [(False, "/dev/null", True), (True, "/dev/null", False), (False, "sim", False)],
+)
+def test_a_real_robot_without_a_calibration_is_warned_of(
+    calibrated: bool, port: str, warned: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(examination, "computer", lambda *_: ())
+    std: Any = 0.01 if calibrated else "uncalibrated"
+    odometry = replace(FILE.odometry, wheel_separation_multiplier_std=std)
+    config = replace(FILE, odometry=odometry, mcu=McuConfig(port=port))
+    found = codes(local(config, Address("tcp/127.0.0.1:1", "acsar", ""), "", 1))
+    assert ("not_calibrated" in found) is warned
+
+
+@pytest.mark.parametrize(("vid", "found"), [(0x2341, []), (0xDEAD, ["port_unknown_board"])])
+def test_a_board_of_another_maker_is_named_with_those_that_are_known(
+    vid: int, found: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    two = [
+        SimpleNamespace(device=device, vid=number, pid=0x42, description="n/a")
+        for device, number in (("/dev/null", vid), ("/dev/zero", 0xBEEF))
+    ]
+    monkeypatch.setattr("serial.tools.list_ports.comports", lambda: two)
+    others = [one for one in serial_port("/dev/null", simulated=False) if "board" in one.code]
+    assert codes(others) == found
+    assert all("dead:0042" in one.text and "2341:0042" in one.text + one.mend for one in others)
+
+
 def test_a_setting_with_a_surprising_effect_is_a_warning_also_without_a_daemon() -> None:
     with socket.create_server(("127.0.0.1", 0)) as closed:
         nowhere = f"tcp/127.0.0.1:{closed.getsockname()[1]}"
@@ -357,6 +433,27 @@ def test_a_setting_with_a_surprising_effect_is_a_warning_also_without_a_daemon()
     assert doubtful.level == "warning"
     assert "port_missing" in codes(found)
     assert "port_simulated" not in codes(found)
+
+
+@pytest.mark.parametrize(("year", "code"), [(1970, "clock_wrong"), (2026, "clock_right")])
+def test_a_computer_without_a_clock_starts_long_ago(
+    year: int, code: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    wall_ns = (year - 1970) * 31_557_600 * 10**9 + 10**15
+    monkeypatch.setattr(clock, "now", lambda: SimpleNamespace(wall_ns=wall_ns))
+    (found,) = clock_year()
+    assert found.code == code
+    assert str(year) in found.text
+
+
+@pytest.mark.parametrize("runs", [True, False])
+@pytest.mark.parametrize("wanted", [True, False])
+def test_the_computer_is_examined_for_the_daemon_that_runs(
+    wanted: bool, runs: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pid = os.getpid() if runs else None
+    monkeypatch.setattr(local_findings, "slowness", lambda: ())  # a measurement of 0.3 s
+    assert [*scheduling(wanted, pid)] == [*computer(wanted, pid)][-1:]
 
 
 def test_without_real_time_in_the_configuration_no_warning_is_given() -> None:
@@ -373,6 +470,22 @@ def test_each_present_cause_of_lateness_is_a_warning_with_a_remedy(tmp_path: Pat
     assert "power supply" in findings[0].mend
     assert "powersave keeps the processor at 600 of 1500 MHz" in findings[1].text
     assert "schedutil" in findings[1].mend
+
+
+def test_heat_or_steal_during_the_measurement_is_named_and_that_of_before_is_not(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    kernel = Kernel(write(tmp_path, QUIET | {COUNT: "5\n"}))
+    stolen = (
+        "cpu  0 0 0 0 0 0 0 0 0 0\ncpu0 4563760 1967646 673613 1415998 7026 0 17675 99999 0 0\n"
+    )
+    for files, code in (
+        ({COUNT: "5\n"}, "computer_well"), ({COUNT: "6\n"}, "computer_hot"),
+        ({COUNT: "6\n"}, "computer_well"), ({"proc/stat": stolen}, "computer_steal"),
+        ({"proc/stat": stolen}, "computer_well"),
+    ):  # fmt: skip
+        monkeypatch.setattr(time, "sleep", lambda _, f=files: write(tmp_path, f))
+        assert codes(slowness(kernel)) == [code]
 
 
 def test_a_newer_version_that_is_not_in_use_is_a_warning_with_the_command(

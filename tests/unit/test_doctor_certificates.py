@@ -23,6 +23,7 @@ from acsard.host.errors import NotPermittedError
 from acsard.machine.authority import Authority
 from acsard.machine.certificate_findings import certificates, router_certificates
 from acsard.machine.finding import Finding
+from tests.each import each
 
 DAY_NS = 86400 * NS_PER_S
 
@@ -140,6 +141,20 @@ def test_for_a_directory_that_this_user_may_not_look_into_sudo_is_advised(
         finally:
             Path(place).chmod(0o700)
             directory.chmod(0o700)
+
+
+@each(("mode", "open_key"), [(0o600, False), (0o400, False), (0o640, True), (0o604, True)])
+def test_a_key_that_the_group_or_others_may_read_is_named(mode: int, open_key: bool) -> None:
+    with TemporaryDirectory() as place:
+        Authority.make(Path(place), "test", 30).issue(Path(place), "robot", ["localhost"], 90)
+        (Path(place) / "key.pem").chmod(mode)
+        found = [one.code for one in certificates(place)]
+    assert ("certificates_open_key" in found) is open_key
+    assert found[-1] == "certificate_valid"
+
+
+def test_without_certificates_there_is_nothing_to_find() -> None:
+    assert list(certificates("")) == []
 
 
 def expiring(fleet: Path) -> None:

@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 import os
+import pty
 import subprocess
 import sys
 from collections.abc import Iterable, Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
 from acsard.core.values import NS_PER_S
 from acsard.host.kernel_counters import Conditions, Kernel, Reading, SlowClock, slow_clock
-from acsard.machine import local_findings
+from acsard.machine import local_findings, serial_ports
 from tests.unit.kernel_files import COOLER, COUNT, FIRMWARE, HWMON, POLICY, QUIET, write
 
 
@@ -99,6 +101,42 @@ def test_a_processor_that_became_hot_between_two_looks_is_named(
     write(tmp_path, later)
     causes = local_findings.slowdowns(before, kernel.read(), NS_PER_S)
     assert [cause.code for cause in causes] == ["computer_hot"] * bool(later)
+
+
+@pytest.mark.parametrize(
+    ("usb_id", "board"), [("2341:0042", "Arduino Mega 2560 R3"), ("dead:beef", ""), ("", "")]
+)
+def test_a_serial_port_has_its_links_its_board_and_its_users(
+    usb_id: str, board: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    vid, pid = (int(part or "0", 16) for part in (usb_id or ":").split(":"))
+    ends = pty.openpty()
+    path = os.ttyname(ends[1])
+    by_id = tmp_path / "by-id"
+    by_id.mkdir()
+    for name, target in (("usb-b", path), ("usb-a", path), ("usb-other", "/dev/null")):
+        (by_id / name).symlink_to(target)
+    (by_id / "file").touch()
+    ports = [
+        SimpleNamespace(
+            device=device, vid=vid if usb_id else None, pid=pid, description=description
+        )
+        for device, description in ((path, "USB2.0-Serial"), ("/dev/a", "n/a"))
+    ]
+    monkeypatch.setattr("serial.tools.list_ports.comports", lambda: ports)
+    monkeypatch.setattr(serial_ports, "BY_ID", by_id)
+    try:
+        first, second = serial_ports.serial_devices()
+    finally:
+        for end in ends:
+            os.close(end)
+    assert (first.device, first.names, first.description) == ("/dev/a", [], "")
+    assert (second.device, second.description) == (path, "USB2.0-Serial")
+    assert second.names == [str(by_id / "usb-a"), str(by_id / "usb-b")]
+    assert (second.usb_id, second.board) == (usb_id, board)
+    assert [holder.pid for holder in second.holders] == [os.getpid()]
+    monkeypatch.setattr(serial_ports, "BY_ID", tmp_path / "none")
+    assert serial_ports.serial_devices()[1].names == []
 
 
 @contextmanager

@@ -111,6 +111,9 @@ def test_a_reader_that_was_removed_is_not_called_any_more() -> None:
         os.write(other, b"x")
         await asyncio.sleep(0.02)
         assert calls == [2]
+        loop.add_reader(fd, reading(fd, lambda: calls.append(3)))
+        await asyncio.sleep(0.02)
+        assert calls == [2, 3], "the same descriptor may have a reader again"
 
     with pipe() as (fd, other):
         run(main())

@@ -101,7 +101,8 @@ async def test_one_read_takes_the_lines_of_a_stall_that_are_longer_than_a_read_o
     connection: Connection,
 ) -> None:
     os.write(connection.board, LINE * 100)
-    await asyncio.sleep(0.05)  # a thread of the kernel carries them through the pty
+    # A thread of the kernel carries them through the pty, in pieces.
+    await until(lambda: connection.device.in_waiting == 100 * len(LINE))
     transport = await connection.connect()
     await until(lambda: connection.chunks)
     assert connection.chunks == [LINE * 100]
@@ -120,10 +121,14 @@ async def test_bytes_that_the_driver_refuses_are_not_kept_and_the_port_still_rea
     assert transport.get_write_buffer_size() == 0
     os.set_blocking(connection.board, False)
     received = b""
-    for _ in range(50):
+
+    def has_all() -> bool:
+        nonlocal received
         with suppress(BlockingIOError):
             received += os.read(connection.board, 65536)
-        await asyncio.sleep(0.001)
+        return len(received) >= sent
+
+    await until(has_all)
     assert received == (LINE * sent)[:sent]
     os.write(connection.board, LINE)
     await until(lambda: b"".join(connection.chunks) == LINE)

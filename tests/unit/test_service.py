@@ -225,7 +225,8 @@ def test_acsard_gets_into_the_path_unless_there_is_one(machine: Path) -> None:
     assert linking() == []
     command = machine / COMMAND.relative_to("/")
     command.unlink()
-    command.parent.rmdir()
+    for place in (command.parent, command.parents[1]):
+        place.rmdir()
     (step,) = linking()
     step.do()
     assert command.readlink() == PROGRAM
@@ -246,12 +247,14 @@ def test_a_removal_says_what_it_leaves_and_a_purge_leaves_nothing(
     kept = [str(step) for step in steps if isinstance(step, Keep)]
     assert len(kept) == len(KEPT_BY_REMOVAL)
     assert all("; --purge removes it" in text for text in kept)
+    # The command of another installation stays.
+    (machine / COMMAND.relative_to("/")).symlink_to("/usr/bin/another")
     # The units are gone, so nothing is stopped.
     for step in uninstalling(purge=True):
         assert step in REMOVE_COMMANDS or isinstance(step, Remove)
         if isinstance(step, Remove):
             step.do()
-    assert files_in(machine) == set()
+    assert files_in(machine) == {str(COMMAND.relative_to("/"))}
 
 
 def test_the_files_are_those_of_deploy_with_the_port_of_a_real_robot() -> None:
@@ -260,6 +263,19 @@ def test_the_files_are_those_of_deploy_with_the_port_of_a_real_robot() -> None:
     assert rules.content == (source() / "udev" / RULES.name).read_bytes()
     assert (unit.path.name, gateway.path.name, page.path.name) == (UNIT, GATEWAY, PAGE)
     assert b'port = "/dev/acsar"' in configuration.content
+
+
+def test_force_replaces_each_changed_file_but_the_configuration(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in ("CONFIG_DIRECTORY", "UNIT_DIRECTORY"):
+        monkeypatch.setattr(service_installation, name, tmp_path)
+    monkeypatch.setattr(service_installation, "RULES", tmp_path / RULES.name)
+    for file in files():
+        file.path.write_text("mine")
+    steps = installing(files(), force=True)
+    kept = [step.path.name for step in steps if isinstance(step, Keep)]
+    assert (kept, sum(isinstance(step, Write) for step in steps)) == (["acsard.toml"], 4)
 
 
 def test_after_a_write_and_a_removal_the_directory_is_unchanged(tmp_path: Path) -> None:

@@ -9,17 +9,24 @@ import inspect
 import os
 import shutil
 import signal
+from collections.abc import Iterable
+from contextlib import nullcontext
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
+import msgspec
 import pytest
 
 from acsard.cli import main
-from acsard.host.errors import MendableError
+from acsard.core.messages.schema import Twist, Vector3
+from acsard.host.errors import MendableError, NoAnswerError
 from acsard.machine import service_installation, upgrade, versions
 from acsard.machine.deploy_files import source
 from acsard.machine.service_installation import GATEWAY, PAGE, RULES, UNIT
 from acsard.machine.upgrade import change, prepare, unit_state, watch
 from tests.system.harness import free_endpoint
+from tests.unit.screens import STATE
 
 OLD, NEW = "0.2.0", "0.3.0"
 
@@ -27,6 +34,7 @@ OLD, NEW = "0.2.0", "0.3.0"
 SYSTEMCTL = """\
 #!/bin/sh
 echo "$@" >>{root}/calls
+[ "$1" = reset-failed ] && exit 1  # the unit has never been loaded
 [ "$1" = show ] || exit 0
 state={root}/$2
 [ -e $state-$(readlink {home}/current) ] && state=$state-$(readlink {home}/current)
@@ -137,6 +145,106 @@ def test_a_version_that_refuses_the_configuration_is_not_used(machine: Machine) 
 
 def test_a_daemon_that_runs_and_does_not_answer_is_not_changed(machine: Machine) -> None:
     machine.state(UNIT, "active")
+    with pytest.raises(MendableError, match="nobody knows whether the robot stands"):
+        change(NEW, machine.said.append)
+    assert machine.links == (OLD, "")
+
+
+STANDS, DRIVES, TURNS = (0.0, 0.0), (0.5, 0.0), (0.0, 0.6)
+
+
+class Answering:
+    """A daemon that sends these speeds, m/s and rad/s, each for a second. The last one stays.
+
+    Without speeds it is silent. A pause of the upgrade advances its time.
+    """
+
+    new_link = "up"  # of the version `NEW`
+
+    def __init__(self, speeds: Iterable[tuple[float, float]]) -> None:
+        self.now_s, self._speeds = 0.0, [*speeds]
+
+    def get(self, key: str) -> Any:
+        if not self._speeds:
+            raise NoAnswerError(key)
+        linear, angular = self._speeds[min(int(self.now_s), len(self._speeds) - 1)]
+        twist = Twist(Vector3(linear, 0.0, 0.0), Vector3(0.0, 0.0, angular))
+        # The wheels of a heavy robot have not begun to turn.
+        link = self.new_link if versions.current() == NEW else "up"
+        state = msgspec.structs.replace(
+            STATE, wheels=[0.0] * 4, reason="commanded by nav", link=link
+        )
+        return {"cmd_vel_out": SimpleNamespace(twist=twist), "state": state}[key]
+
+    def sleep(self, seconds: float) -> None:
+        self.now_s += seconds
+
+    def answer(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        """Be the daemon and the clock of `upgrade`."""
+        clock = SimpleNamespace(monotonic=lambda: self.now_s, sleep=self.sleep)
+        monkeypatch.setattr(upgrade, "time", clock)
+        monkeypatch.setattr(upgrade, "answers", lambda endpoint: True)
+        monkeypatch.setattr(upgrade, "open_connection", lambda address: nullcontext(self))
+
+
+@pytest.mark.parametrize(
+    ("speeds", "changed_s"),
+    [
+        ([STANDS], 2.0),
+        # A pause of a second is no standstill.
+        ([DRIVES, STANDS, TURNS, STANDS], 5.0),
+        ([DRIVES], None),
+        ([TURNS], None),
+    ],
+)
+def test_a_running_robot_is_changed_when_it_has_stood_for_two_seconds(
+    speeds: list[tuple[float, float]],
+    changed_s: float | None,
+    machine: Machine,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    machine.state(UNIT, "active")
+    daemon = Answering(speeds)
+    daemon.answer(monkeypatch)
+    if changed_s is None:
+        with pytest.raises(MendableError, match=r"robot drives \(commanded by nav\); stop it"):
+            change(NEW, machine.said.append, wait_s=3.0)
+        assert daemon.now_s == pytest.approx(3.0, abs=0.3)
+        assert machine.links == (OLD, "")
+        return
+    machine.program(machine.home / "0.1.0" / "bin" / versions.STOP_PROGRAM, "")
+    change(NEW, machine.said.append, wait_s=9.0, watch_s=4.0)
+    assert machine.links == (NEW, OLD)
+    assert machine.calls()[-1] == f"restart --no-block {UNIT}"
+    # The new version is watched to the end.
+    assert daemon.now_s == pytest.approx(changed_s + 4.0, abs=0.3)
+    assert versions.installed() == [OLD, NEW], "an older version is removed"
+    assert [text.partition(";")[0] for text in machine.said] == [
+        f"version {NEW} accepts {machine.config}",
+        "waiting until the robot stands, at most 9 s",
+        f"version {NEW} is in use",
+        f"version {NEW} works",
+    ]
+
+
+def test_a_version_that_loses_the_link_of_the_one_before_is_left_again(
+    machine: Machine, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    machine.state(UNIT, "active")
+    daemon = Answering([STANDS])
+    daemon.new_link = "down"
+    daemon.answer(monkeypatch)
+    trouble = rf"{NEW} has no link to the microcontroller \(down\); version {OLD} runs again"
+    with pytest.raises(MendableError, match=trouble):
+        change(NEW, machine.said.append, watch_s=1.0)
+    assert machine.links == (OLD, "")
+
+
+def test_a_daemon_that_accepts_a_connection_and_stays_silent_is_not_changed(
+    machine: Machine, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    machine.state(UNIT, "active")
+    Answering([]).answer(monkeypatch)
     with pytest.raises(MendableError, match="nobody knows whether the robot stands"):
         change(NEW, machine.said.append)
     assert machine.links == (OLD, "")

@@ -123,6 +123,17 @@ def test_a_huge_file_is_refused_without_being_read_to_its_end(tmp_path: Path, us
         tracemalloc.stop()
 
 
+@pytest.mark.parametrize("use", [*USES][2:])
+def test_a_pipe_in_the_place_of_the_file_is_neither_read_nor_replaced(
+    use: str, tmp_path: Path
+) -> None:
+    pipe = tmp_path / "acsard.toml"
+    os.mkfifo(pipe)
+    with pytest.raises(MendableError, match="was not changed: it is not a regular file; edit the"):
+        USES[use](pipe)
+    assert pipe.is_fifo()
+
+
 def test_two_changes_at_once_lose_neither(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A slow disk keeps the first change waiting for its sync while the second one begins."""
     file, syncs = tmp_path / "robot.toml", threading.Event()
