@@ -18,7 +18,8 @@ from msgspec import Struct, field
 
 from acsard.calibration.geometry import LEFT, RIGHT, TRACK, Base
 from acsard.calibration.hypotheses import HUBER, Match, gyro_bias, matched, sensors
-from acsard.calibration.log import Complexes, Floats, LogError, Mask, Run
+from acsard.calibration.log import LogError, Run
+from acsard.calibration.series import Complexes, Floats, Mask
 from acsard.core.config.settings import Config
 
 BIAS, SCALE, GYRO_DELAY, POSE_DELAY, AHEAD, ASIDE = range(TRACK + 1, TRACK + 7)
@@ -46,6 +47,9 @@ MIN_RUNS = 3  # of which each is left out whole, and not a part of it, for the d
 FARTHEST = 3.0  # deviations of the prior, by which a piece that is left out moves a parameter
 
 SURE = 2.0  # standard deviations by which the new values must be better, or else by half
+# ... or the values this far from the configured ones, by sensors: a person misreads a tape. Sound
+# robots: 5.9 and less; wrong by 1 %: 9 and more.
+FAR = 8.0
 CAP = 10.0  # robust standard deviations: a residual of a run that was left out counts as at most
 AGREES = 2.0  # deviations of a reading by tape
 OTHER_TRACK, SHOWN = 0.4, 1.1  # a log that shows its track fits others worse, by this factor
@@ -327,7 +331,10 @@ class Fit(Struct, frozen=True):
 
     @property
     def better(self) -> bool:
-        sure = self.gain > min(SURE * self.gain_std, math.log(2.0))
+        moved = self.p[GEOMETRY]
+        far = float(moved @ np.linalg.solve(self.covariance, moved)) > FAR**2
+        surely = self.gain > min(SURE * self.gain_std, math.log(2.0))
+        sure = surely or (far and self.readings is None)
         return sure and self.gain > 0.0 and self.worst > -WORSE
 
     @property

@@ -7,7 +7,8 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from acsard.calibration.log import Floats, LogError, read, with_distance
+from acsard.calibration.log import LogError, read, with_distance
+from acsard.calibration.series import Floats
 from tests.unit.calibration_logs import run, usual
 from tests.unit.calibration_robots import Robot, drive
 
