@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from itertools import pairwise
 
 import numpy as np
 import numpy.typing as npt
@@ -230,13 +231,13 @@ def _without_spans(runs: Sequence[Run], spans: Sequence[Span]) -> tuple[list[Run
         if not own:
             made.append(run)
             continue
-        at, first = run.t[0], len(made)
-        for begin, end in (*own, (run.t[-1], run.t[-1])):
-            if begin - at > LEAST_PART_S:
-                made.append(run.part(at, begin))
-            if end > begin:
-                parts.append(f"{begin:.0f} to {end:.0f} s of run {run.name}")
-            at = max(at, end)
+        apart = [at for at, (span, last) in enumerate(pairwise(own), 1) if last[0] > span[1]]
+        own = [(part[0][0], part[-1][1])
+               for part in (own[a:b] for a, b in pairwise((0, *apart, len(own))))]  # fmt: skip
+        parts += [f"{begin:.0f} to {end:.0f} s of run {run.name}" for begin, end in own]
+        edges, first = (run.t[0], *(t for span in own for t in span), run.t[-1]), len(made)
+        made += [run.part(begin, end) for begin, end in zip(edges[::2], edges[1::2], strict=True)
+                 if end - begin > LEAST_PART_S]  # fmt: skip
         made[first + 1 :] = [
             replace(part, name=f"{part.name}.{k}") for k, part in enumerate(made[first + 1 :], 2)
         ]
