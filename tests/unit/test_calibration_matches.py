@@ -36,6 +36,7 @@ TRACK, SIZE, RIGHT = 1.4925, 1.005, 1.01
 def log(
     *names: str, late: float = 0.0, lever: complex = 0j, hz: float = 5.0, left: float = 1.0,
     right: float = 1.0, name: str = "1", drive: Columns = DRIVE, carried: float = 0.0,
+    step: float = 0.05,
 ) -> Run:  # fmt: skip
     """Return a drive. The sensors are late, s; the speeds of a side are multiplied.
 
@@ -46,7 +47,7 @@ def log(
         return np.asarray(np.interp(t, drive["t"], drive[name]))
 
     end, rng = float(drive["t"][-1]), np.random.default_rng(1)
-    t, at = np.arange(0.0, end, 0.05), np.arange(0.0, end, 1 / hz)
+    t, at = np.arange(0.0, end, step), np.arange(0.0, end, 1 / hz)
     streams: dict[str, tuple[Floats, ...]] = {}
     streams["left right"] = (t, left * value("left", t), right * value("right", t))
     if "gyro" in names:

@@ -48,6 +48,7 @@ ROBOTS = 6
 """Number of robots in a row."""
 
 GYRO_SCALE = 0.005
+CONFIG = Config(odometry=OdometryConfig(gyro_scale_std=GYRO_SCALE))
 
 SKID = Robot(chi=1.5, rate=0.0, slip=0.02, outliers=0.0)
 DIFFERENTIAL = Robot(chi=1.0, rate=0.0, slip=0.003, left=0.99, right=1.01, outliers=0.0)
@@ -110,12 +111,12 @@ ROWS = [
 def configs(log: Sequence[Run]) -> tuple[DriveConfig, OdometryConfig]:
     """Return the configuration that `--write` makes from the defaults and this log."""
     tables: dict[str, dict[str, float]] = {}
-    for key, value in calibrate(Log(tuple(log), ()), Config(), "").settings.items():
+    for key, value in calibrate(Log(tuple(log), ()), CONFIG, "").settings.items():
         section, _, name = key.partition(".")
         tables.setdefault(section, {})[name] = value
     return (
         structs.replace(DriveConfig(), **tables.get("drive", {})),
-        structs.replace(OdometryConfig(), **tables.get("odometry", {})),
+        structs.replace(CONFIG.odometry, **tables.get("odometry", {})),
     )
 
 
@@ -178,7 +179,7 @@ def measured(kind: Set, way: str, robots: int) -> Row:
         log = kind.log(rng, scale)
         driven = kind.runs(log, way)
         robot, counts = configs(driven), kind.robot.counts
-        found = fit(driven, Config())
+        found = fit(driven, CONFIG)
         left, right, track = (math.exp(found.p[index]) for index in (LEFT, RIGHT, TRACK))
         true = kind.track(log) / math.sqrt(kind.robot.left * kind.robot.right)
         tracks.append(math.log(track / math.sqrt(left * right) / true) / found.shares[0])
