@@ -103,6 +103,10 @@ def calibrate(log: Log, config: Config, source: str) -> Result:
             )
         few = [f"{NAMES[sensor]} is left out, because it has too few values: 1 Hz or more is needed"
                for sensor in matches if sensor not in found.sensors]  # fmt: skip
+        if found.halves:
+            few.append(f"the halves of the log contradict each other by {found.halves:.0%}, which "
+                       "widens the deviations: did the load, the tyres, the floor or the counts "
+                       "change? Then calibrate each half alone")  # fmt: skip
         log = Log(log.runs, (*_too_good(found), *few, *log.notes))
         return _require_drive(_result(log, config, source, found))
     except LogError as error:

@@ -384,3 +384,28 @@ def test_runs_that_hardly_move_are_no_pieces() -> None:
     assert whole.seconds == long.seconds
     assert len(cut([long], 8)) == 8
     assert len(cut([long], 40)) == 13  # of 3 s at least
+
+
+@pytest.mark.parametrize(
+    ("sides", "rate"), [((1.3, 1.3), 1.0), ((1.6, 1.6), 1.0), ((1.15, 1.0), 1.0), ((1, 1), 1.2)]
+)
+def test_halves_of_a_log_that_contradict_each_other_widen_the_deviations(
+    sides: tuple[float, float], rate: float
+) -> None:
+    """The load, the tyres, the counts or the gyro change between two drives."""
+    sound, other = (sensed("gyro", name=name, drive=LONG) for name in "ab")
+    left, right, turned = sides[0] * other.left, sides[1] * other.right, rate * other.turned
+    other = structs.replace(other, left=left, right=right, turned=turned, rate=rate * other.rate)
+    found, before, after = (fit(runs, Config()) for runs in ([sound, other], [sound], [other]))
+    track, ratio = (found.p @ row for row in ROWS)
+    assert found.halves > 0.05
+    for half in (before, after):
+        assert half.halves == 0.0
+        assert abs(half.p @ ROWS[0] - track) < 3 * found.shares[0]
+        assert abs(half.p @ ROWS[1] - ratio) < 3 * found.shares[1]
+
+
+LONG = motion(LEGS * 2)
+ROWS = np.zeros((2, 9))
+ROWS[0, [TRACK, LEFT, RIGHT]] = 1.0, -0.5, -0.5
+ROWS[1, [RIGHT, LEFT]] = 1.0, -1.0
