@@ -46,8 +46,8 @@ PIECES = 12  # at least
 WHOLE_S = 60.0
 MIN_RUNS = 3  # of which each is left out whole, and not a part of it, for the deviations
 FARTHEST = 3.0  # deviations of the prior, by which a piece that is left out moves a parameter
-# Halves of a log that contradict each other: sound ones differ by 1.7 deviations, or by 0.018.
-MIN_PIECES, HALVES, SURELY, MOST = 8, 0.05, 3.0, 0.6
+# Halves of a log that contradict each other: sound ones differ by 1.7 deviations, or by 0.061.
+MIN_PIECES, HALVES, SURELY, MOST = 8, 0.08, 3.0, 0.6
 
 SURE = 2.0  # standard deviations by which the new values must be better, or else by half
 # ... or the values this far from the configured ones, by sensors: a person misreads a tape. Sound
