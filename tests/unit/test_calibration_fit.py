@@ -240,11 +240,6 @@ def test_a_gyro_that_is_late_biased_and_interrupted_gives_the_same_track() -> No
     assert multipliers(found)[0] == pytest.approx(expected, rel=0.01)
 
 
-def test_positions_that_are_late_give_the_same_track() -> None:
-    trips = [drive(Robot(late=late, rng=np.random.default_rng(3)), GUIDED) for late in (0.0, 0.3)]
-    same_but_for_a_delay(*(fitted(trip, gyro=False) for trip in trips))
-
-
 def test_headings_alone_show_no_size_of_the_wheels() -> None:
     trip, rng = usual(), np.random.default_rng(2)
     noisy = replace(trip, yaw=trip.yaw + rng.normal(0.0, 0.004, len(trip.yaw)))

@@ -207,8 +207,8 @@ def test_four_wheels_count_by_the_mean_of_their_side() -> None:
 
 def test_a_gyro_that_repeats_its_value_for_more_than_1_s_of_turning_is_left_out() -> None:
     t = 0.05 * np.arange(400)
-    left, right, rate = 3 + np.sin(t), 3 - np.sin(t), -0.2 * np.sin(t)
-    for begin, seconds, left_out in ((3.0, 0.9, 0), (3.0, 1.8, 37), (3.0, 5.0, 101)):
+    left, right, rate = 4 + 3 * np.sin(t), 4 - 3 * np.sin(t), -0.2 * np.sin(t)
+    for begin, seconds, left_out in ((3.0, 0.9, 0), (3.0, 1.1, 23), (3.0, 5.0, 101)):
         hung = (t > begin - 1e-6) & (t < begin + seconds + 1e-6)
         shown = np.where(hung, rate[np.argmax(hung)], rate)
         log = read(text(series(t, left, right, shown)))
