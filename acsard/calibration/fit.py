@@ -18,11 +18,13 @@ from msgspec import Struct, field
 
 from acsard.calibration.geometry import LEFT, RIGHT, TRACK, Base
 from acsard.calibration.hypotheses import HUBER, Match, gyro_bias, matched, sensors
-from acsard.calibration.log import Complexes, Floats, LogError, Mask, Run
+from acsard.calibration.log import LogError, Run
+from acsard.calibration.series import Complexes, Floats, Mask
 from acsard.core.config.settings import Config
 
 BIAS, SCALE, GYRO_DELAY, POSE_DELAY, AHEAD, ASIDE = range(TRACK + 1, TRACK + 7)
 GEOMETRY = slice(LEFT, TRACK + 1)
+SHARES = np.array([[-0.5, -0.5, 1.0], [-1.0, 1.0, 0.0], [0.5, 0.5, 0.0]])  # of Fit.shares
 
 # Standard deviations before a log is known: tyres and load change the radii by 2 %, and skidding
 # may double the track. With the scale of a bad gyro, a track would rather stay as configured.
@@ -44,8 +46,13 @@ PIECES = 12  # at least
 WHOLE_S = 60.0
 MIN_RUNS = 3  # of which each is left out whole, and not a part of it, for the deviations
 FARTHEST = 3.0  # deviations of the prior, by which a piece that is left out moves a parameter
+# Halves of a log that contradict each other: sound ones differ by 1.7 deviations, or by 0.061.
+MIN_PIECES, HALVES, SURELY, MOST = 8, 0.08, 3.0, 0.6
 
 SURE = 2.0  # standard deviations by which the new values must be better, or else by half
+# ... or the values this far from the configured ones, by sensors: a person misreads a tape. Sound
+# robots: 5.9 and less; wrong by 1 %: 9 and more.
+FAR = 8.0
 CAP = 10.0  # robust standard deviations: a residual of a run that was left out counts as at most
 AGREES = 2.0  # deviations of a reading by tape
 OTHER_TRACK, SHOWN = 0.4, 1.1  # a log that shows its track fits others worse, by this factor
@@ -118,6 +125,11 @@ def centered(values: Floats) -> Floats:
         weight = np.minimum(1.0, HUBER * np.median(size) / np.maximum(size, 1e-12)) + 1e-12
         off = values - weight @ values / weight.sum()
     return off
+
+
+def deviations(covariance: Floats) -> Floats:
+    """Return the relative deviations of track / mean radius, right / left radius, and radius."""
+    return np.asarray(np.sqrt(np.einsum("ri,ij,rj->r", SHARES, covariance, SHARES)))
 
 
 class Alignment(Struct, frozen=True):
@@ -247,9 +259,17 @@ class Problem:
         left_out = np.array([found.without(group)[self.free] for group in groups])
         apart, n = left_out - left_out.sum(axis=0) / max(1, len(groups)), max(1, len(groups))
         jackknife = apart.T @ apart * (n - 1) / n
-        return np.asarray(
-            (jackknife + scale @ np.linalg.inv(found.whole) @ scale)[GEOMETRY, GEOMETRY]
-        )
+        made = (jackknife + scale @ np.linalg.inv(found.whole) @ scale)[GEOMETRY, GEOMETRY]
+        # Two robots, loads or floors in one log are no scatter of one, so they widen it as a whole.
+        ends = np.cumsum([piece.run.seconds for piece in self.pieces])
+        if "tape" not in self.sensors and len(ends) >= MIN_PIECES:
+            first = ends <= ends[-1] / 2
+            moved = (found.without(first) - found.without(~first))[GEOMETRY]
+            off = np.abs(SHARES @ moved)
+            if np.any(off > np.maximum(HALVES, SURELY * deviations(made))):
+                found.halves = min(float(off.max()), MOST)
+                made += np.outer(moved, moved) * (found.halves / off.max() / 2) ** 2
+        return np.asarray(made)
 
 
 class Solution(Struct):
@@ -264,6 +284,7 @@ class Solution(Struct):
     score: Floats
     left_out: Floats = field(default_factory=lambda: np.zeros(0))  # without each piece
     covariance: Floats = field(default_factory=lambda: np.zeros(0))  # of GEOMETRY
+    halves: float = 0.0  # by which the halves of the log contradict each other, as a fraction
 
     @property
     def whole(self) -> Floats:
@@ -324,18 +345,20 @@ class Fit(Struct, frozen=True):
     sized: bool  # the log shows the size of the wheels, not only their ratio
     tracked: bool  # the log shows the track: another one fits it worse
     gyro_std: float  # share by which the track errs because no other sensor shows the gyro's scale
+    halves: float  # by which the halves of the log contradict each other, as a fraction
 
     @property
     def better(self) -> bool:
-        sure = self.gain > min(SURE * self.gain_std, math.log(2.0))
+        moved = self.p[GEOMETRY]
+        far = float(moved @ np.linalg.solve(self.covariance, moved)) > FAR**2
+        surely = self.gain > min(SURE * self.gain_std, math.log(2.0))
+        sure = surely or (far and self.readings is None)
         return sure and self.gain > 0.0 and self.worst > -WORSE
 
     @property
     def shares(self) -> Floats:
         """Relative deviations of track / mean radius, right / left radius, and mean radius."""
-        rows = np.array([[-0.5, -0.5, 1.0], [-1.0, 1.0, 0.0], [0.5, 0.5, 0.0]])
-        squares = np.einsum("ri,ij,rj->r", rows, self.covariance, rows)
-        return np.asarray(np.sqrt(squares + np.array([self.gyro_std**2, 0.0, 0.0])))
+        return np.hypot(deviations(self.covariance), [self.gyro_std, 0.0, 0.0])
 
 
 def fit(runs: Sequence[Run], config: Config, matches: dict[str, Match] | None = None) -> Fit:
@@ -421,7 +444,7 @@ def _judged(problem: Problem, solution: Solution, base: Base, gyro_std: float) -
         solution.without, float(gain.sum()), spread, float(gain.min()), turn,
         errors.get("positions"), errors.get("tape"),
         bool({"positions", "tape"} & set(problem.sensors)), _tracked(problem, solution.p),
-        gyro_std if _by_gyro_alone(problem) else 0.0,
+        gyro_std if _by_gyro_alone(problem) else 0.0, solution.halves,
     )  # fmt: skip
 
 

@@ -7,7 +7,7 @@ import math
 import numpy as np
 from msgspec import Struct
 
-from acsard.calibration.log import Complexes, Floats
+from acsard.calibration.series import Complexes, Floats
 from acsard.core.config.settings import DriveConfig
 from acsard.core.values import Metres
 

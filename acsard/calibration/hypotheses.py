@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from itertools import pairwise
 
 import numpy as np
 import numpy.typing as npt
@@ -18,12 +19,14 @@ from msgspec import Struct
 from msgspec.structs import replace
 
 from acsard.calibration.geometry import Base, path
-from acsard.calibration.log import MIXED, Complexes, Floats, LogError, Mask, Run
+from acsard.calibration.log import MIXED, LogError, Run
+from acsard.calibration.series import Complexes, Floats, Mask, in_blocks
 from acsard.core.config.settings import DriveConfig
 from acsard.core.values import Seconds
 
 STEP_S, WINDOW_S, GRID_S = 1.0, 10.0, 0.05  # of turns, of positions, and of the wheels' path
-MAX_SPOTS, SEARCH_S = 2000, 200.0  # positions that are compared, and parts that are searched
+MIN_SPOTS, MAX_SPOTS = 10, 2000  # positions of a window, and of a log
+SEARCH_S = 200.0  # of the parts that are searched
 APART_S = 60.0  # between two runs on their common axis of time
 MIN_ROLL, LEAST_TURN = 0.02, 1e-3  # rad, in a step that shows something
 HUBER = 1.5  # robust standard deviations, beyond which a position counts less
@@ -55,12 +58,6 @@ STILL, ALONE = 1e-3, 0.2  # of a side that stands, rad in a step, and what the o
 TWICE, BACKWARDS = 0.02, 1e-3  # share of the rolled angle; rad in a row
 UNLIKE = 20.0  # ways of one side / of the other, that no robot drives
 OVERFLOWS, USUAL = 3.0, 0.9  # of this quantile of the steps of a running count
-
-# A gyro has two levels beside the wheels if this share of its rows is near one of them, this share
-# near the rarer one, and they are apart by so many of their spreads and this share of the larger.
-# Sound logs: 0.57, 3 spreads, 3 changes. Two IMUs by turns: 1.0, 20 spreads, 6 changes and more.
-NEAR, RARER, SPREADS, LEVELS_APART, CHANGES = 0.7, 0.1, 8.0, 0.2, 6
-FAST, STEADY = 0.3, 0.05  # share of the fast turns, which is compared; of a turn that is kept
 
 NAMES = {"gyro": "yaw_rate", "headings": "yaw", "positions": "x, y"}
 COLUMNS = {
@@ -151,9 +148,10 @@ def examined(
     sensor that is left, and notes. Raise `LogError` with the cause that explains a contradiction.
     """
     base, notes = Base.of(drive), list[str]()
-    if fact := _alternates(runs, base):
-        if sensors(runs) == ["gyro"]:
-            raise LogError(f"{fact}. Record only one of them")
+    fact, of_wheels = _alternates(runs, base)
+    if (fact and sensors(runs) == ["gyro"]) or of_wheels:
+        raise LogError(f"{fact or of_wheels}. Record only one of them")
+    if fact:
         runs, notes = [without(run, "gyro") for run in runs], [f"yaw_rate is left out: {fact}"]
     matches = {sensor: matched(sensor, runs, base) for sensor in sensors(runs)}
     odd = {s: m for s, m in matches.items() if not (m.given and m.follows) or m.bad}
@@ -211,41 +209,17 @@ def gyro_bias(runs: Sequence[Run]) -> tuple[float, float]:
     return (float(np.median(rest)), REST_BIAS_STD) if known else (0.0, BIAS_STD)
 
 
-def _alternates(runs: Sequence[Run], base: Base) -> str:
+def _alternates(runs: Sequence[Run], base: Base) -> tuple[str, str]:
     # What a gyro that is now this, now that share of the wheels' turn shows: two sensors in blocks.
+    # And the same of the wheels.
     found = [(np.zeros(0), np.zeros(0))]
     for run in runs:
         left, right = (np.gradient(side, run.t) for side in (run.left, run.right))
         turn = np.interp(run.gyro_t, run.t, base.right * right - base.left * left) / base.track
         found.append((turn, run.rate))
     turn, rate = (np.concatenate(columns) for columns in zip(*found, strict=True))
-    size = np.abs(turn)
-    usual = float(np.quantile(size, 0.9)) if len(size) else 0.0
-    fast = np.flatnonzero(size > max(1e-6, FAST * usual))
-    if len(fast) < MIN_RESTS:
-        return ""
-    share = rate[fast] / turn[fast]
-    low, high = np.quantile(share, [RARER, 1 - RARER])
-    for _ in range(ROUNDS):
-        upper = share > (low + high) / 2
-        if upper.all() or not upper.any():
-            return ""
-        low, high = np.median(share[~upper]), np.median(share[upper])
-    off, apart = np.abs(share - np.where(upper, high, low)), float(high - low)
-    spread = 1.48 * max(float(np.median(off[upper])), float(np.median(off[~upper])))
-    near = off < apart / 4
-    rows, upper = fast[near], upper[near]
-    kept = np.abs(np.diff(turn[rows])) < STEADY * size[rows[1:]]
-    changes = int(((np.diff(upper.astype(int)) != 0) & (np.diff(rows) < 4) & kept).sum())
-    if (
-        near.mean() < NEAR or min(upper.mean(), 1 - upper.mean()) < RARER or changes < CHANGES
-        or apart < max(SPREADS * spread, LEVELS_APART * max(abs(low), abs(high)))
-    ):  # fmt: skip
-        return ""
-    return (
-        f"yaw_rate is now {low:.2f}, now {high:.2f} times the turn rate of the wheels, and changes "
-        f"{changes} times while they keep theirs, as if two programs or sensors wrote it by turns "
-        "(two IMUs on one topic)"
+    return in_blocks("yaw_rate", rate, "the turn rate of the wheels", turn), in_blocks(
+        "the turn rate of the wheels", turn, "yaw_rate", rate - gyro_bias(runs)[0]
     )
 
 
@@ -257,13 +231,13 @@ def _without_spans(runs: Sequence[Run], spans: Sequence[Span]) -> tuple[list[Run
         if not own:
             made.append(run)
             continue
-        at, first = run.t[0], len(made)
-        for begin, end in (*own, (run.t[-1], run.t[-1])):
-            if begin - at > LEAST_PART_S:
-                made.append(run.part(at, begin))
-            if end > begin:
-                parts.append(f"{begin:.0f} to {end:.0f} s of run {run.name}")
-            at = max(at, end)
+        apart = [at for at, (span, last) in enumerate(pairwise(own), 1) if last[0] > span[1]]
+        own = [(part[0][0], part[-1][1])
+               for part in (own[a:b] for a, b in pairwise((0, *apart, len(own))))]  # fmt: skip
+        parts += [f"{begin:.0f} to {end:.0f} s of run {run.name}" for begin, end in own]
+        edges, first = (run.t[0], *(t for span in own for t in span), run.t[-1]), len(made)
+        made += [run.part(begin, end) for begin, end in zip(edges[::2], edges[1::2], strict=True)
+                 if end - begin > LEAST_PART_S]  # fmt: skip
         made[first + 1 :] = [
             replace(part, name=f"{part.name}.{k}") for k, part in enumerate(made[first + 1 :], 2)
         ]
@@ -460,8 +434,11 @@ class Comparison:
             made[name] = np.concatenate(parts)
         made |= {n: np.concatenate([getattr(r, n) for r in runs]) for n in ("place", "yaw")}
         self.run = replace(runs[0], **made)
+        # Few positions fit any wheels, because each window is turned and moved.
+        steps = np.diff(self.run.place_t)
+        self.window_s = max(WINDOW_S, MIN_SPOTS * float(np.median(steps)) if len(steps) else 0.0)
         self.begin, self.end = self._edges(runs, STEP_S)
-        self.windows = self._edges(runs, WINDOW_S)
+        self.windows = self._edges(runs, self.window_s)
 
     def _edges(self, runs: Sequence[Run], step: Seconds) -> tuple[Floats, Floats]:
         edges = [run.edges(step) + shift for run, shift in zip(runs, self.shift, strict=True)]
@@ -587,8 +564,8 @@ class Places(Comparison):
         self.rolling = self.rolled(self.grid[:-1], self.grid[1:])
         # A part of a long log suffices for the search.
         every = int(sum(run.seconds for run in runs) / SEARCH_S)
-        parts = [run.part(a, a + WINDOW_S) for run in runs
-                 for a in np.arange(run.t[0], run.t[-1] - STEP_S, WINDOW_S)]  # fmt: skip
+        parts = [run.part(a, a + self.window_s) for run in runs
+                 for a in np.arange(run.t[0], run.t[-1] - STEP_S, self.window_s)]  # fmt: skip
         self.few = Places(sensor, parts[::every], base) if 1 < every < len(parts) / 3 else self
 
     def fitted(self, ratio: float, track: float, delay: Seconds) -> tuple[float, Floats, Floats]:

@@ -19,8 +19,9 @@ import zenoh
 from acsard.bus.subscription import Subscription, encoded
 from acsard.calibration.fit import ASIDE
 from acsard.calibration.geometry import Base
-from acsard.calibration.log import APPLIED, Floats, LogError, Notes, Run, run_of
+from acsard.calibration.log import APPLIED, LogError, Notes, Run, run_of
 from acsard.calibration.plan import Leg, Move
+from acsard.calibration.series import Floats
 from acsard.client.connection import Connection
 from acsard.client.driving import Driver, drive
 from acsard.client.follower import FIRST_STATE_TIMEOUT_S

@@ -19,15 +19,20 @@ import numpy.typing as npt
 from msgspec import Struct, field
 from msgspec.structs import replace
 
+from acsard.calibration.series import (
+    MIN_ROWS,
+    Complexes,
+    Floats,
+    Mask,
+    apart,
+    by_chance,
+    by_turns,
+)  # fmt: skip
 from acsard.core.formatting import printable
 from acsard.core.values import AcsardError, Metres, Seconds
 from acsard.host.errors import MendableError, RecordingError
 from acsard.recording.export import calibration_csv
 from acsard.recording.file import MAGIC, Recording
-
-Floats = npt.NDArray[np.float64]
-Complexes = npt.NDArray[np.complex128]
-Mask = npt.NDArray[np.bool_]
 
 FOUR, TWO = ("fr", "fl", "rl", "rr"), ("left", "right")
 APPLIED = "applied_linear", "applied_angular"
@@ -37,7 +42,7 @@ COLUMNS = {
     "yaw": "rad", "applied_linear": "m/s", "applied_angular": "rad/s", "run": "a name",
 }  # fmt: skip
 
-MIN_ROWS, MIN_RUN_S = 8, 1.5
+MIN_RUN_S = 1.5
 MAX_STEP_S, MAX_SECONDS = 1.5, 6 * 3600.0  # between rows of the wheels, and of a log
 BACK_S = 1.0  # a jump back of the time by which a new run begins
 GAP_S, GAP_PERIODS = 1.0, 8.0  # a gap of the wheels that ends a run: longer than both
@@ -46,16 +51,6 @@ MAX_RUNS = 1000  # names in the column `run`
 STANDSTILL_SPEED = 0.02  # rad/s, up to which a wheel stands
 REST_S = 0.4  # over which the wheels must hardly roll: an encoder at rest may rock between counts
 REST_ROLL = 0.03  # rad
-
-BACK, NOISES = 0.2, 12.0  # of the jump to a wrong value; of the quartile of all jumps
-FAR_SHARES, FAR_STEPS = 3.0, 5.0  # of the range of the values; of the usual step of positions
-
-# Of 6,720 simulated sides (16 to 3,200 counts, 10 to 100 Hz), 5 look like two series by these, and
-# none together with the other side. Of two series in one side, 6 in 10 are found.
-CYCLE_ROWS, CYCLES, MIN_BLOCKS = range(2, 8), 6, 3  # rows of a cycle; cycles of a block; blocks
-MOVING, STILL, OTHER_SHARE = 0.3, 0.002, 0.15  # of the usual speed, twice; of the present speed
-STEPS, SURE = 1.2, 4.0  # jumps at slow speeds; standard deviations of the mean
-MAX_OTHER, MIN_MOVING = 0.3, 5  # share of the blocks that move; and so many of them
 
 STUCK_S, STUCK_TURN = 1.0, 0.3  # a gyro that repeats one value while the wheels' turn changes, rad
 
@@ -220,7 +215,8 @@ def read(data: bytes) -> Log:
         wheels = [name for name in (*FOUR, *TWO) if name in columns]
         whole = np.isfinite([columns[name] for name in wheels]).all(axis=0)
         mixed = [name for name in wheels if by_turns(columns[name][whole])]
-        if mixed and by_turns(*(columns[name][whole] for name in wheels)):
+        values = [columns[name][whole] for name in wheels]
+        if by_chance(np.array(values)) or (mixed and by_turns(*values)):
             raise LogError(MIXED.format(" and ".join(wheels)))
         columns["left"], columns["right"] = _sides(table)
         runs = []
@@ -317,60 +313,6 @@ def _used(header: Sequence[str]) -> list[str]:
     if len(set(used)) < len(used) or header.count("run") > 1:
         raise LogError(f"the first line names a column twice: {ADVICE}")
     return used
-
-
-def apart(values: Floats | Complexes) -> Mask:
-    """Return a mask of single values that are wrong: a jump leads there, and the next one back."""
-    mask = np.zeros(len(values), dtype=bool)
-    if len(values) < MIN_ROWS:
-        return mask
-    jumps = np.abs(np.diff(values))
-    least = (
-        max(NOISES * float(np.quantile(jumps, 0.25)), FAR_STEPS * float(np.median(jumps)))
-        if np.iscomplexobj(values)
-        else FAR_SHARES * float(np.quantile(np.abs(values), 0.95))
-    )
-    mask[1:-1] = np.minimum(jumps[1:], jumps[:-1]) > least
-    mask[1:-1] &= np.abs(values[2:] - values[:-2]) < BACK * jumps[:-1]
-    return mask
-
-
-def by_turns(*columns: Floats | Complexes) -> bool:
-    """Return whether in the same rows of a short cycle, all columns have values of another series.
-
-    A coarse encoder jumps to and fro by the same step at any speed. Of two series, the difference
-    grows with the speed. Rates are real; positions and directions are complex.
-    """
-    values = np.array(columns)
-    places, size = np.iscomplexobj(values), np.abs(values)
-    usual = np.quantile(size, 0.95, axis=1)[:, None] if size.size else size
-    for period in CYCLE_ROWS:
-        half, count = period // 2, (values.shape[1] - period) // (period * CYCLES)
-        if count < MIN_BLOCKS:
-            break
-        kernel = np.full(2 * half + 1, 1 / period)
-        kernel[[0, -1]] *= 1.0 if period % 2 else 0.5
-        smooth = np.array([np.convolve(column, kernel, "same") for column in values])
-        off, sizes = (
-            v[:, half : half + count * period * CYCLES].reshape(-1, count, CYCLES, period)
-            for v in (values - smooth, size)
-        )
-        mean, speed = off.mean(axis=2), sizes.mean(axis=(2, 3))
-        least = np.median(np.abs(values[:, period:] - values[:, :-period]), axis=1)[:, None]
-        moves = np.full(speed.shape, places)
-        if not places:
-            moves = speed > MOVING * usual
-            slow = ~moves & (speed > STILL * usual)
-            jumps = np.abs(off).max(axis=(2, 3))
-            step = [np.median(j[s]) if s.sum() > 1 else u / 2
-                    for j, s, u in zip(jumps, slow, usual[:, 0], strict=True)]  # fmt: skip
-            least = np.maximum(OTHER_SHARE * speed, STEPS * np.array(step)[:, None])
-        spread = np.sqrt((np.abs(off - mean[:, :, None]) ** 2).mean(axis=2) / CYCLES)
-        other = np.abs(mean) > np.maximum(SURE * spread, least[:, :, None])
-        blocks = (other & moves[:, :, None]).all(axis=0).any(axis=1).sum()
-        if blocks > MAX_OTHER * max(MIN_MOVING, moves.all(axis=0).sum()):
-            return True
-    return False
 
 
 def _sides(table: _Table) -> tuple[Floats, Floats]:

@@ -26,7 +26,8 @@ from acsard.calibration.fit import (
     Piece,
     aligned,
 )
-from acsard.calibration.log import Complexes, Floats, Run
+from acsard.calibration.log import Run
+from acsard.calibration.series import Complexes, Floats
 from acsard.core.config.settings import OdometryConfig
 from acsard.core.values import Seconds
 

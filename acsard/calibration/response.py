@@ -9,7 +9,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from acsard.calibration.log import Floats, Mask, Run
+from acsard.calibration.log import Run
+from acsard.calibration.series import Floats, Mask
 from acsard.core.config.settings import DriveConfig
 from acsard.core.motion.kinematics import Kinematics
 from acsard.core.values import Seconds, Twist

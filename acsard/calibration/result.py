@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from itertools import combinations
 
 import numpy as np
@@ -16,9 +17,10 @@ from rich.console import RenderableType
 from acsard.calibration.fit import AGREES, Errors, Fit, fit
 from acsard.calibration.geometry import LEFT, RIGHT, TRACK
 from acsard.calibration.hypotheses import NAMES, Match, examined, forward, without
-from acsard.calibration.log import Floats, Log, LogError, Run, TapeReading
+from acsard.calibration.log import Log, LogError, Run, TapeReading
 from acsard.calibration.noise import Noise, noise
 from acsard.calibration.response import response_time
+from acsard.calibration.series import Floats
 from acsard.core.config.settings import Config
 from acsard.core.config.toml_text import excerpt
 from acsard.core.formatting import many
@@ -31,6 +33,9 @@ CONTRADICTION, CONTRADICTIONS = 0.1, 4.0  # of two tracks, as a fraction and in 
 ALONE_RUNS = 40  # of many runs, these suffice to compare the tracks by two sensors
 EXACT_TURN, EXACT_M = 3e-4 * math.tau, 3e-4  # errors below those of a sensor: of a turn, rad; m
 MIN_ROLLED = 20.0  # rad, by the wheels of a log
+# Share of its usual speed by which a wheel of a long log changes in 1 s: 0.5 and more of a robot
+# that stops and turns, 0.13 of one whose t is in 1/100 s.
+LONG_S, ABRUPT = 1000.0, 0.2
 DRIVE = (
     "stand for 3 s, drive 2 m ahead and back, turn three times to each side, slowly and fast, then "
     "drive curves: 60 s in all"
@@ -83,14 +88,26 @@ def calibrate(log: Log, config: Config, source: str) -> Result:
         _require_motion(log.runs)
         runs, matches, notes = examined(log.runs, config.drive)
         log = Log(tuple(runs), (*notes, *log.notes))
-        _require_one_robot(runs, config, matches)
+        alone = _require_one_robot(runs, config, matches)
         found = fit(runs, config, matches)
+        vague = [sensor for sensor, each in alone.items() if not each.better]
+        if not found.better and len(vague) < len(alone):
+            words = [f"{NAMES[s]} is left out: no value is surely better by it" for s in vague]
+            log = Log(tuple(without(run, *vague) for run in runs), (*words, *log.notes))
+            matches = {sensor: match for sensor, match in matches.items() if sensor not in vague}
+            found = fit(log.runs, config, matches)
         if not found.tracked:
             raise LogError(
                 f"{' and '.join(found.sensors)} show no track, because others fit them as well: "
                 + (forward(runs) or "drive on after each turn on the spot, and drive curves")
             )
-        log = Log(log.runs, (*_too_good(found), *log.notes))
+        few = [f"{NAMES[sensor]} is left out, because it has too few values: 1 Hz or more is needed"
+               for sensor in matches if sensor not in found.sensors]  # fmt: skip
+        if found.halves:
+            few.append(f"the halves of the log contradict each other by {found.halves:.0%}, which "
+                       "widens the deviations: did the load, the tyres, the floor or the counts "
+                       "change? Then calibrate each half alone")  # fmt: skip
+        log = Log(log.runs, (*_too_good(found), *few, *log.notes))
         return _require_drive(_result(log, config, source, found))
     except LogError as error:
         for note in log.notes:
@@ -115,6 +132,16 @@ def _require_motion(runs: Sequence[Run]) -> None:
             f"the wheels roll only {rolled:.1f} rad in this log. If the robot drove farther, t is "
             f"not in s, or the speeds of the wheels are not in rad/s; else {DRIVE}"
         )
+    seconds = sum(run.seconds for run in runs)
+    speeds = [np.diff(np.interp(run.edges(1.0), run.t, side)) for run in runs
+              for side in (run.left, run.right)]  # fmt: skip
+    usual = float(np.quantile(np.abs(np.concatenate(speeds)), 0.95))
+    change = max(float(np.abs(np.diff(speed, prepend=speed[0])).max()) for speed in speeds) / usual
+    if seconds > LONG_S and change < ABRUPT:
+        raise LogError(
+            f"in {seconds:.0f} s, no wheel changes by more than {change:.0%} of its usual speed "
+            "within 1 s, but robots start and stop faster: is t in s, and not in 1/100 s or ms?"
+        )
 
 
 def _require_drive(result: Result) -> Result:
@@ -130,15 +157,18 @@ def _require_drive(result: Result) -> Result:
     return result
 
 
-def _require_one_robot(runs: Sequence[Run], config: Config, matches: Mapping[str, Match]) -> None:
+def _require_one_robot(
+    runs: Sequence[Run], config: Config, matches: Mapping[str, Match]
+) -> dict[str, Fit]:
     # Sensors that contradict each other are not mixed: each is fitted alone first.
+    alone = dict[str, Fit]()
     if len(matches) < 2:
-        return
+        return alone
     some = runs[:: 1 + len(runs) // ALONE_RUNS]
-    alone = {}
     for sensor, match in matches.items():
         others = [other for other in NAMES if other != sensor]
-        alone[sensor] = fit([without(run, *others) for run in some], config, {sensor: match})
+        with suppress(LogError):  # it has too few values
+            alone[sensor] = fit([without(run, *others) for run in some], config, {sensor: match})
     values = {
         sensor: (found.p[TRACK] - (found.p[LEFT] + found.p[RIGHT]) / 2, found.shares[0])
         for sensor, found in alone.items() if found.tracked
@@ -154,6 +184,7 @@ def _require_one_robot(runs: Sequence[Run], config: Config, matches: Mapping[str
                 f"{NAMES[a]} and {NAMES[b]} contradict each other: the track is {words}, in wheel "
                 "separations. Leave the column of the wrong sensor out"
             )
+    return alone
 
 
 def _result(log: Log, config: Config, source: str, found: Fit) -> Result:

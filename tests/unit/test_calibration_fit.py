@@ -12,10 +12,25 @@ import numpy as np
 import pytest
 from msgspec import structs
 
-from acsard.calibration.fit import AHEAD, ASIDE, BIAS, GYRO_DELAY, POSE_DELAY, Fit, Piece, fit
+from acsard.calibration.fit import (
+    AHEAD,
+    ASIDE,
+    BIAS,
+    GYRO_DELAY,
+    POSE_DELAY,
+    Errors,
+    Fit,
+    Piece,
+    aligned,
+    centered,
+    cut,
+    fit,
+    moves,
+)  # fmt: skip
 from acsard.calibration.geometry import LEFT, RIGHT, TRACK, Base
-from acsard.calibration.log import LogError, TapeReading
+from acsard.calibration.log import LogError, Notes, TapeReading, run_of
 from acsard.core.config.settings import Config, OdometryConfig
+from tests.unit.calibration_bags import motion
 from tests.unit.calibration_logs import (
     IDEAL,
     WAYS,
@@ -37,6 +52,8 @@ from tests.unit.calibration_robots import (
     slow_square,
     wander,
 )  # fmt: skip
+from tests.unit.test_calibration_matches import LEGS
+from tests.unit.test_calibration_matches import log as sensed
 
 each_way = pytest.mark.parametrize("way", WAYS)
 
@@ -223,11 +240,6 @@ def test_a_gyro_that_is_late_biased_and_interrupted_gives_the_same_track() -> No
     assert multipliers(found)[0] == pytest.approx(expected, rel=0.01)
 
 
-def test_positions_that_are_late_give_the_same_track() -> None:
-    trips = [drive(Robot(late=late, rng=np.random.default_rng(3)), GUIDED) for late in (0.0, 0.3)]
-    same_but_for_a_delay(*(fitted(trip, gyro=False) for trip in trips))
-
-
 def test_headings_alone_show_no_size_of_the_wheels() -> None:
     trip, rng = usual(), np.random.default_rng(2)
     noisy = replace(trip, yaw=trip.yaw + rng.normal(0.0, 0.004, len(trip.yaw)))
@@ -274,3 +286,121 @@ def test_one_drive_of_55_s_by_positions_is_nearly_as_good_as_the_best_fit(seed: 
     rms = [float(np.sqrt(np.mean(off(p) ** 2))) for p in (found.p, best)]
     print(f"{1000 * rms[0]:.1f} mm found, {1000 * rms[1]:.1f} mm best")
     assert rms[0] < 1.5 * rms[1]
+
+
+def test_the_place_and_the_delay_of_a_sensor_have_their_sign() -> None:
+    found = fit([sensed("positions", lever=0.1 + 0.05j, late=0.2)], Config())
+    assert found.p[[POSE_DELAY, AHEAD, ASIDE]] == pytest.approx([0.2, 0.1, 0.05], abs=0.004)
+    assert multipliers(found) == pytest.approx([1.5, 1.0, 1.01], abs=0.001)
+    assert found.tracked
+    assert found.shares == pytest.approx([0.004, 0.004, 0.001], rel=0.5)
+
+
+def test_positions_that_jump_move_the_values_by_little_and_widen_them() -> None:
+    run = sensed("positions", lever=0.1 + 0.05j)
+    run.place[::20] += 0.3
+    found = fit([run], Config())
+    assert multipliers(found) == pytest.approx([1.5, 1.0, 1.01], abs=0.001)
+    assert found.shares == pytest.approx([0.010, 0.0085, 0.0025], rel=0.5)
+
+
+def test_long_runs_are_cut_and_each_piece_may_be_left_out() -> None:
+    found = fit([sensed("gyro", name=str(n), drive=PARTS[n]) for n in range(4)], Config())
+    assert len(found.pieces) > 4  # they are cut, so that there are twelve
+    assert {piece.run.name for piece in found.pieces} == {"0", "1", "2", "3"}
+    assert multipliers(found)[0] == pytest.approx(1.4925, abs=0.004)
+    first = np.array([piece.run.name == "0" for piece in found.pieces])
+    assert found.without(first) == pytest.approx(found.p, abs=0.01)
+    assert np.any(found.without(first) != found.p)
+
+
+PARTS = [motion([(2, 0, 0), *LEGS[at : at + 3], (2, 0, 0)]) for at in (1, 3, 5, 7)]
+
+
+def test_points_are_aligned_without_the_wrong_ones() -> None:
+    rng = np.random.default_rng(1)
+    model = np.exp(1j * np.linspace(0.0, 3.0, 60)) + np.linspace(0.0, 2.0, 60)
+    noise = 0.001 * rng.normal(size=(2, 60))
+    seen = (2 - 3j) + np.exp(0.7j) * (model + noise[0] + 1j * noise[1])
+    seen[[10, 40]] += 5.0, 3j
+    found = aligned(seen, model)
+    assert np.angle(found.turn) == pytest.approx(0.7, abs=0.001)
+    assert abs(found.turn) == pytest.approx(1.0)
+    sound = np.delete(np.abs(found.off), [10, 40])
+    assert sound.max() < 0.01
+    assert found.weight[[10, 40]].max() < 0.01
+    assert abs(found.off[10] - 5.0 * np.exp(-0.7j)) < 0.02
+
+
+def test_values_are_centered_without_the_wrong_ones() -> None:
+    rng = np.random.default_rng(1)
+    values = 5.0 + 0.01 * rng.normal(size=60)
+    values[[3, 30]] = 9.0, 400.0
+    off = centered(values)
+    assert np.delete(off, [3, 30]).mean() == pytest.approx(0.0, abs=0.003)
+    assert off[30] - off[3] == pytest.approx(391.0)
+
+
+@pytest.mark.parametrize(
+    ("gain", "std", "worst", "off", "tape", "better"),
+    [
+        (0.21, 0.1, 0.2, 0.0, False, True),
+        (0.19, 0.1, 0.2, 0.0, False, False),  # not by two deviations
+        (0.70, 9.0, 0.2, 0.0, False, True),  # but by half
+        (0.69, 9.0, 0.2, 0.0, False, False),
+        (0.21, 0.1, -0.019, 0.0, False, True),
+        (0.21, 0.1, -0.021, 0.0, False, False),  # another sensor is worse
+        (0.01, 0.1, 0.2, 8.1, False, True),  # far from the configured values
+        (0.01, 0.1, 0.2, 7.9, False, False),
+        (0.01, 0.1, 0.2, 8.1, True, False),  # which a person may have misread
+        (-0.01, 0.1, 0.2, 8.1, False, False),
+    ],
+)
+def test_new_values_are_written_if_they_are_surely_better(
+    gain: float, std: float, worst: float, off: float, tape: bool, better: bool
+) -> None:
+    found = fit([sensed("gyro")], Config())
+    p = np.concatenate(([0.0, 0.0, 0.01 * off], found.p[3:]))
+    found = structs.replace(
+        found, gain=gain, gain_std=std, worst=worst, p=p, covariance=1e-4 * np.eye(3),
+        readings=Errors(1.0, 1.0) if tape else None,
+    )  # fmt: skip
+    assert found.better is better
+
+
+def test_runs_that_hardly_move_are_no_pieces() -> None:
+    t = np.arange(0.0, 9.0, 0.05)
+    for angle, some in ((0.19, False), (0.21, True)):
+        run = run_of("1", {"left right": (t, 0 * t, 0 * t + angle / t[-1])}, Notes())
+        assert moves(run) is some
+        assert bool(cut([run], 1)) is some
+    long = sensed("gyro")
+    (whole,) = cut([long], 1)
+    assert whole.seconds == long.seconds
+    assert len(cut([long], 8)) == 8
+    assert len(cut([long], 40)) == 13  # of 3 s at least
+
+
+@pytest.mark.parametrize(
+    ("sides", "rate"), [((1.3, 1.3), 1.0), ((1.6, 1.6), 1.0), ((1.15, 1.0), 1.0), ((1, 1), 1.2)]
+)
+def test_halves_of_a_log_that_contradict_each_other_widen_the_deviations(
+    sides: tuple[float, float], rate: float
+) -> None:
+    """The load, the tyres, the counts or the gyro change between two drives."""
+    sound, other = (sensed("gyro", name=name, drive=LONG) for name in "ab")
+    left, right, turned = sides[0] * other.left, sides[1] * other.right, rate * other.turned
+    other = structs.replace(other, left=left, right=right, turned=turned, rate=rate * other.rate)
+    found, before, after = (fit(runs, Config()) for runs in ([sound, other], [sound], [other]))
+    track, ratio = (found.p @ row for row in ROWS)
+    assert found.halves > 0.08
+    for half in (before, after):
+        assert half.halves == 0.0
+        assert abs(half.p @ ROWS[0] - track) < 3 * found.shares[0]
+        assert abs(half.p @ ROWS[1] - ratio) < 3 * found.shares[1]
+
+
+LONG = motion(LEGS * 2)
+ROWS = np.zeros((2, 9))
+ROWS[0, [TRACK, LEFT, RIGHT]] = 1.0, -0.5, -0.5
+ROWS[1, [RIGHT, LEFT]] = 1.0, -1.0

@@ -17,9 +17,10 @@ from msgspec.structs import replace
 from acsard.calibration.geometry import Base
 from acsard.calibration.guide import MAX_REPEATS, Options, drive, guided, require_own
 from acsard.calibration.leg import require_path
-from acsard.calibration.log import Floats, Log, LogError, Notes, Run, run_of
+from acsard.calibration.log import Log, LogError, Notes, Run, run_of
 from acsard.calibration.plan import FLOOR_M, METHODS, Leg, Move, Setup, legs
 from acsard.calibration.result import calibrate
+from acsard.calibration.series import Floats
 from acsard.core.config.parsing import effective, parse
 from acsard.core.config.settings import Config
 from acsard.core.values import AcsardError

@@ -16,6 +16,7 @@ import pytest
 from acsard.calibration.geometry import path
 from acsard.calibration.log import Log, LogError, Notes, read, run_of
 from acsard.calibration.result import Result, calibrate
+from acsard.calibration.series import Mask
 from acsard.core.config.settings import Config, DriveConfig
 from tests.unit import planted_logs
 from tests.unit.calibration_bags import DRIVE, END, motion
@@ -108,6 +109,14 @@ def test_planted_faults_are_never_written_and_named_in_80_percent() -> None:
     assert planted_logs.main() == 0
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [8200, 8202])
+def test_radii_that_are_1_percent_apart_are_written_although_positions_gain_little(
+    seed: int,
+) -> None:
+    assert planted_logs.outcome(planted_logs.log("", "positions", seed), seed) == "right"
+
+
 # coarse encoders
 
 FOUR = ("fl", "fr", "rl", "rr")
@@ -115,7 +124,9 @@ SLOW = motion([(2, 0, 0), *[(6, v, w) for v, w in ((0.1, 0), (0, 0.4), (-0.1, 0)
 
 
 @pytest.mark.parametrize("wheels", [("left", "right"), FOUR])
-@pytest.mark.parametrize("counts", [16, 32, 96, 360, 3200])
+@pytest.mark.parametrize(
+    "counts", [16, 360, *[pytest.param(n, marks=pytest.mark.slow) for n in (32, 96, 3200)]]
+)
 def test_coarse_encoders_are_no_two_series(counts: int, wheels: tuple[str, ...]) -> None:
     for hz in (10, 20, 30, 50, 100):
         for driven in (DRIVE, SLOW):
@@ -150,11 +161,43 @@ def test_two_drivers_of_all_wheels_are_named_although_the_gyro_shows_no_size(
     assert f"left and right, {MIXED}" in refusal(csv(rows))
 
 
+def of_two_writers(names: tuple[str, ...], factor: float, second: Mask) -> bytes:
+    """Return a log of whose wheel speeds some rows are those of another program."""
+    rows = sound(3, names)
+    mixed = times(factor, "left", "right")(rows)
+    return csv(rows | {n: np.where(second, mixed[n], rows[n]) for n in ("left", "right")})
+
+
+@pytest.mark.parametrize("factor", [0.0, 0.5, 2.0, -1.0])
+@pytest.mark.parametrize("share", [0.05, 0.2, 0.5])
+def test_two_writers_of_the_wheels_by_chance_are_named(share: float, factor: float) -> None:
+    second = np.random.default_rng(3).random(len(sound(3, ())["t"])) < share
+    with pytest.raises(LogError, match=f"left and right, {MIXED}"):
+        read(of_two_writers(GYRO if factor > 0.0 else PLACES, factor, second))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("factor", [0.0, 0.5, 2.0, -1.0])
+@pytest.mark.parametrize("block_s", [0.5, 1.0, 3.0, 10.0])
+def test_two_writers_of_the_wheels_in_blocks_are_named(block_s: float, factor: float) -> None:
+    second = sound(3, ())["t"] // block_s % 2 < 1
+    words = refusal(of_two_writers(GYRO, factor, second))
+    assert re.search("the turn rate of the wheels is now .* by turns", words)
+
+
 # situations of real logs, and their siblings
 
 
 def with_time(unit: float, names: tuple[str, ...] = GYRO) -> bytes:
     return csv(times(unit, "t")(sound(1, names)))
+
+
+def at_rate(hz: int, unit: float) -> bytes:
+    """Return a log by gyro with this rate, whose t has another unit."""
+    rows, t = sound(1, GYRO), np.arange(0.0, END, 1 / hz)
+    return csv(
+        {"t": unit * t} | {n: np.interp(t, rows["t"], v) for n, v in rows.items() if n != "t"}
+    )
 
 
 def thinned(rows: Columns, every: int) -> Columns:
@@ -191,7 +234,7 @@ def carried(names: tuple[str, ...], begin: float, seconds: float = 20.0) -> byte
     return csv(made)
 
 
-def gps(seed: int, hz: int = 1) -> bytes:
+def gps(seed: int, hz: float = 1) -> bytes:
     """Return a log with a sound gyro beside a cheap GPS receiver."""
     rows, rng = sound(seed, ("yaw_rate", *PLACES)), np.random.default_rng(seed)
     drift = np.zeros((2, int(END) + 3))
@@ -201,7 +244,7 @@ def gps(seed: int, hz: int = 1) -> bytes:
     for k, name in enumerate(PLACES):
         place = np.interp(t, DRIVE["t"], DRIVE[name]) + drift[k][t.astype(int)]
         place += rng.normal(0, 0.1, len(t))
-        rows[name] = np.where(np.arange(len(t)) % (50 // hz), np.nan, place)
+        rows[name] = np.where(np.arange(len(t)) % int(50 / hz), np.nan, place)
     return csv(rows)
 
 
@@ -347,6 +390,8 @@ CAUSES: dict[str, tuple[Callable[[], bytes], str]] = {
     "IMUs by chance, other axis": (
         lambda: changed(GYRO, 2, lambda r: by_chance(r, 0.02)), "by turns"),
     "t in 1/100 s, by gyro": (lambda: with_time(100.0), "is t in s"),
+    "t in 1/100 s at 100 Hz": (lambda: at_rate(100, 100.0), "is t in s"),
+    "t in ms at 1000 Hz": (lambda: at_rate(1000, 1000.0), "is t in s"),
     "t in ns": (lambda: with_time(1e9, BOTH), "is t in s"),
     "swapped, by all": (
         lambda: changed((*BOTH, *HEADING), 3, lambda r: r | {"left": r["right"],
@@ -391,6 +436,9 @@ RIGHT: dict[str, tuple[Callable[[], bytes], tuple[float, ...], str]] = {
     "map with y to the north": (
         lambda: changed(BOTH, 3, lambda r: r | {"x": -r["y"], "y": r["x"]}), BY_POSES, ""),
     "carried, by gyro": (lambda: carried(GYRO, 40.0), BY_GYRO, LEFT_OUT),
+    "gps at 1 Hz, by chance near the wheels": (lambda: gps(20), BY_GYRO, "x, y is left out"),
+    "gps at 0.5 Hz": (lambda: gps(4, 0.5), BY_GYRO, "x, y is left out"),
+    "gps at 0.2 Hz": (lambda: gps(22, 0.2), BY_GYRO, "x, y is left out"),
     "gps at 2 Hz": (lambda: gps(7, 2), BY_GYRO, "x, y is left out"),
     "gps at 5 Hz": (lambda: gps(5, 5), BY_GYRO, "x, y is left out"),
     "gyro about another axis": (
@@ -416,6 +464,7 @@ def test_what_contradicts_all_others_is_left_out(kind: str) -> None:
     right(data(), truth, note)
 
 
+@pytest.mark.slow
 def test_a_sensor_that_was_computed_from_the_wheels_is_noted() -> None:
     trip = usual()
     rate = (trip.right - trip.left) * 0.05 / 0.45

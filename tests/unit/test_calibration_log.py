@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import pytest
 
-from acsard.calibration.log import Floats, LogError, read, with_distance
+from acsard.calibration.log import LogError, read, with_distance
+from acsard.calibration.series import Floats
 from tests.unit.calibration_logs import run, usual
 from tests.unit.calibration_robots import Robot, drive
 
@@ -124,3 +126,134 @@ def test_a_distance_is_that_of_the_straightest_run_or_of_the_named_one() -> None
         with_distance(log, "turns", 3.2)
     with pytest.raises(LogError, match='no run "square"; there are turns, straight'):
         with_distance(log, "square", 3.2)
+
+
+def series(t: Any, *columns: Any) -> list[str]:
+    return [",".join(f"{v:.4f}" for v in row) for row in zip(t, *columns, strict=True)]
+
+
+def steady(t: Any, header: str = HEADER) -> bytes:
+    return text(series(t, *(np.full(len(t), v) for v in (2.0, 3.0, 0.1))), header)
+
+
+def test_a_run_has_8_rows_and_1_5_s() -> None:
+    for count, step in ((32, 0.05), (8, 0.3)):
+        assert len(read(steady(step * np.arange(count))).runs[0].t) == count
+    for count, step in ((30, 0.05), (7, 0.3)):
+        with pytest.raises(LogError, match=r"no run has 8 rows and 1\.5 s"):
+            read(steady(step * np.arange(count)))
+    log = read(steady(np.concatenate((0.05 * np.arange(100), 90 + 0.05 * np.arange(20)))))
+    assert log.notes[-1] == "runs left out because they are too short: 1"
+
+
+def test_rows_up_to_1_5_s_apart_and_6_h_make_a_log() -> None:
+    assert read(steady(1.4 * np.arange(20))).runs[0].seconds == pytest.approx(26.6)
+    with pytest.raises(LogError, match=r"rows of the wheels are 1\.6 s apart"):
+        read(steady(1.6 * np.arange(20)))
+    assert read(steady(1.4 * np.arange(15_300))).runs[0].seconds == pytest.approx(21418.6)
+    with pytest.raises(LogError, match="the drive lasts 6 h"):
+        read(steady(1.4 * np.arange(15_500)))
+
+
+@pytest.mark.parametrize(
+    ("step", "gap", "runs"),
+    [
+        (0.05, 0.95, 1), (0.05, 1.05, 2), (0.2, 1.5, 1), (0.2, 1.7, 2), (0.05, -0.95, 1),
+        (0.05, -1.05, 2), (0.05, -2.0, 2),
+    ],
+)  # fmt: skip
+def test_a_jump_back_and_a_gap_end_a_run(step: float, gap: float, runs: int) -> None:
+    t = step * np.arange(100)
+    log = read(steady(np.concatenate((t, t[-1] + gap + t))))
+    assert len(log.runs) == runs
+    if runs == 2:
+        assert [len(run.t) for run in log.runs] == [100, 100]
+        assert ("after a gap" in log.notes[0]) is (gap > 0)
+
+
+def test_a_column_run_with_more_than_1000_names_is_refused() -> None:
+    rows = [f"{line},{n}" for n, line in enumerate(lines(1001))]
+    with pytest.raises(LogError, match="column run has 1001 different names"):
+        read(text(rows, f"{HEADER},run"))
+    with pytest.raises(LogError, match="no run has"):
+        read(text(rows[:1000], f"{HEADER},run"))
+
+
+@pytest.mark.parametrize(
+    ("header", "words"),
+    [("t_ms,left,right,yaw_rate", 'the column "t_ms" is not .* name it t, .* values in s'),
+     ("t,left_rpm,right,yaw_rate", 'the column "left_rpm" .* name it left, .* in rad/s'),
+     ("t,left,right,yaw_rate,run,run", "names a column twice")],
+)  # fmt: skip
+def test_a_column_with_another_unit_is_named(header: str, words: str) -> None:
+    with pytest.raises(LogError, match=words):
+        read(text(lines(), header))
+
+
+def test_four_wheels_count_by_the_mean_of_their_side() -> None:
+    t = 0.05 * np.arange(200)
+    front, rear = 2 + np.sin(t), 2 - np.sin(t)
+    header = "t,fr,fl,rl,rr,yaw_rate"
+    (run,) = read(text(series(t, rear, front, 1.05 * front, 1.1 * rear, 0 * t), header)).runs
+    (two,) = read(text(series(t, 1.025 * front, 1.05 * rear, 0 * t))).runs
+    assert run.left == pytest.approx(np.asarray(two.left), abs=0.01)
+    assert run.right == pytest.approx(np.asarray(two.right), abs=0.01)
+    for share in (0.86, 1.17):
+        read(text(series(t, rear, front, share * front, rear, 0 * t), header))
+    for share in (0.84, 1.19):
+        with pytest.raises(LogError, match=r"rolls otherwise than (rl|fl) by 16%"):
+            read(text(series(t, rear, front, share * front, rear, 0 * t), header))
+
+
+def test_a_gyro_that_repeats_its_value_for_more_than_1_s_of_turning_is_left_out() -> None:
+    t = 0.05 * np.arange(400)
+    left, right, rate = 4 + 3 * np.sin(t), 4 - 3 * np.sin(t), -0.2 * np.sin(t)
+    for begin, seconds, left_out in ((3.0, 0.9, 0), (3.0, 1.1, 23), (3.0, 5.0, 101)):
+        hung = (t > begin - 1e-6) & (t < begin + seconds + 1e-6)
+        shown = np.where(hung, rate[np.argmax(hung)], rate)
+        log = read(text(series(t, left, right, shown)))
+        assert len(log.runs[0].gyro_t) == 400 - left_out
+        assert len(log.notes) == bool(left_out)
+    assert "exactly from 3 s to 8 s of run 1 (101 samples)" in log.notes[0]
+    log = read(text(series(t, 0 * t + 2.0, 0 * t + 2.0, np.where(hung, 0.1, rate))))
+    assert not log.notes  # it repeats what the wheels do
+
+
+def test_positions_and_headings_that_repeat_the_row_before_are_left_out() -> None:
+    t = 0.05 * np.arange(200)
+    often = np.repeat(t[::4], 4)
+    data = text(series(t, 0 * t + 2.0, 0 * t + 2.0, often, 0 * t, often), "t,left,right,x,y,yaw")
+    log = read(data)
+    assert (len(log.runs[0].place_t), len(log.runs[0].yaw_t)) == (50, 50)
+    assert log.runs[0].place_t[:2] == pytest.approx([0.0, 0.2])
+    assert log.notes == ("rows of x y and yaw left out, because they repeat the row before: 300",)
+
+
+def test_a_single_wrong_position_is_left_out() -> None:
+    t = 0.05 * np.arange(200)
+    x = 0.1 * t + 0.001 * np.sin(40 * t)
+    x[70] += 3.0
+    log = read(text(series(t, 0 * t + 2.0, 0 * t + 2.0, x, 0 * t), "t,left,right,x,y"))
+    assert len(log.runs[0].place) == 199
+    assert log.notes == ("rows of x, y left out, far from those beside them: 1",)
+
+
+def test_a_run_stands_where_its_wheels_hardly_roll() -> None:
+    t = np.arange(0.0, 6.0, 0.05)
+    run = read(text(series(t, *(2.0 * (t > 3.0),) * 2, 0 * t))).runs[0]
+    rests = run.rests(np.array([0.1, 0.2, 1.0, 2.75, 2.9, 4.0, 5.9]))
+    assert rests.tolist() == [False, True, True, True, False, False, False]
+    assert run.edges(2.0) == pytest.approx([0.0, 5.95 / 3, 2 * 5.95 / 3, 5.95])
+    assert run.edges(60.0) == pytest.approx([0.0, 5.95])
+    part = run.part(1.0, 2.0)
+    assert (part.t[0], part.t[-1]) == pytest.approx((1.0, 2.0))
+    assert len(part.t) == len(part.left) == len(part.right) == 21
+
+
+def test_a_distance_is_as_sure_as_a_tape() -> None:
+    t = np.arange(0.0, 6.0, 0.05)
+    (*_, run) = with_distance(read(text(series(t, 0 * t + 2, 0 * t + 2.1, 0 * t))), "", 0.6).runs
+    assert (run.tape[0].std, run.tape[0].quantity) == (0.01, "distance")
+    for left, right in ((2.0, 2.6), (2.0, -2.0), (0.5, 0.5)):  # curved, on the spot, too short
+        with pytest.raises(LogError, match="is not straight"):
+            with_distance(read(text(series(t, 0 * t + left, 0 * t + right, 0 * t))), "", 0.6)

@@ -24,6 +24,7 @@ from acsard.calibration.result import calibrate
 from acsard.core.config.settings import Config, DriveConfig, OdometryConfig
 from acsard.core.link.feedback import Line
 from acsard.core.values import WheelSpeeds
+from tests.unit.calibration_bags import motion
 from tests.unit.calibration_logs import WAYS, by_headings, runs
 from tests.unit.calibration_robots import (
     RADIUS,
@@ -37,6 +38,8 @@ from tests.unit.calibration_robots import (
 )  # fmt: skip
 from tests.unit.nees import AT, errors
 from tests.unit.odometer import Odometer
+from tests.unit.test_calibration_matches import LEGS
+from tests.unit.test_calibration_matches import log as sensed
 
 LINES = 5
 """Feedback lines that are joined to one for the odometry, to save time. Noise adds up."""
@@ -48,6 +51,7 @@ ROBOTS = 6
 """Number of robots in a row."""
 
 GYRO_SCALE = 0.005
+CONFIG = Config(odometry=OdometryConfig(gyro_scale_std=GYRO_SCALE))
 
 SKID = Robot(chi=1.5, rate=0.0, slip=0.02, outliers=0.0)
 DIFFERENTIAL = Robot(chi=1.0, rate=0.0, slip=0.003, left=0.99, right=1.01, outliers=0.0)
@@ -110,12 +114,12 @@ ROWS = [
 def configs(log: Sequence[Run]) -> tuple[DriveConfig, OdometryConfig]:
     """Return the configuration that `--write` makes from the defaults and this log."""
     tables: dict[str, dict[str, float]] = {}
-    for key, value in calibrate(Log(tuple(log), ()), Config(), "").settings.items():
+    for key, value in calibrate(Log(tuple(log), ()), CONFIG, "").settings.items():
         section, _, name = key.partition(".")
         tables.setdefault(section, {})[name] = value
     return (
         structs.replace(DriveConfig(), **tables.get("drive", {})),
-        structs.replace(OdometryConfig(), **tables.get("odometry", {})),
+        structs.replace(CONFIG.odometry, **tables.get("odometry", {})),
     )
 
 
@@ -178,7 +182,7 @@ def measured(kind: Set, way: str, robots: int) -> Row:
         log = kind.log(rng, scale)
         driven = kind.runs(log, way)
         robot, counts = configs(driven), kind.robot.counts
-        found = fit(driven, Config())
+        found = fit(driven, CONFIG)
         left, right, track = (math.exp(found.p[index]) for index in (LEFT, RIGHT, TRACK))
         true = kind.track(log) / math.sqrt(kind.robot.left * kind.robot.right)
         tracks.append(math.log(track / math.sqrt(left * right) / true) / found.shares[0])
@@ -283,3 +287,37 @@ def test_a_gyro_alone_shows_no_noise_of_the_distance() -> None:
     assert shown.yaw_per_metre
     assert shown.distance_per_metre is None
     assert not shown.distance_better
+
+
+LONG = motion(LEGS * 3)
+
+
+@pytest.mark.parametrize(
+    ("names", "seed"), [(("gyro",), 1), (("headings", "positions"), 0), (("positions",), 2)]
+)
+def test_the_noise_of_wheels_that_roll_by_chance_is_found(
+    names: tuple[str, ...], seed: int
+) -> None:
+    # Variances of the heading and of the distance per metre, rad2/m and m2/m.
+    per_metre, distance = (1e-3, 4e-4) if names == ("gyro",) else (1e-4, 1e-4)
+    run, rng = sensed(*names, drive=LONG, late=0.2), np.random.default_rng(seed)
+    left, right = RADIUS * np.diff(run.left), 1.01 * RADIUS * np.diff(run.right)
+    turn, way = rng.normal(size=(2, len(left))) * np.sqrt(
+        np.abs(left + right) / 2 * [[per_metre], [distance]]
+    )
+    track = 1.5 * SEPARATION
+    angles = [
+        np.append(0.0, np.cumsum(side + way + sign * turn * track / 2)) / radius
+        for side, sign, radius in ((left, -1, RADIUS), (right, 1, 1.01 * RADIUS))
+    ]
+    run = structs.replace(run, left=angles[0], right=angles[1])
+    shown = noise([run], fit([run], Config()), OdometryConfig())
+    assert shown.heading_better
+    assert 0.5 * per_metre < (shown.yaw_per_metre or 0.0) < 1.6 * per_metre
+    assert (shown.yaw_per_radian or 1.0) < 0.2 * per_metre
+    assert shown.track < 1e-4
+    if "positions" in names:
+        assert 0.6 * distance < (shown.distance_per_metre or 0.0) < 1.7 * distance
+        assert shown.scale < 1e-5
+    else:
+        assert shown.distance_per_metre is None
