@@ -33,6 +33,7 @@ from tests.pages import ROOT
 from tests.system.browser import Page
 from tests.system.harness import Daemon, cpu_seconds, resident_kb, until
 from tests.systemd.image import build, needs
+from tests.tools.fleet_figures import fleet
 from tests.tools.reference import table
 
 PAGE = ROOT / "deploy/manual/pages/explanation/figures.md"
@@ -218,6 +219,7 @@ SECTIONS: dict[str, Callable[[Path], str]] = {
     "daemon": daemon,
     "page": page,
     "disk": disk,
+    "fleet": fleet,
     "packages": packages,
     "service": service,
     "tests": tests,
