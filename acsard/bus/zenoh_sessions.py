@@ -272,9 +272,7 @@ def client_session(endpoint: str, tls: str = "") -> zenoh.Session:
             if why is None
             else joined(why).text
         )
-        error = UnreachableError(f"no daemon answers at {endpoint}: {text}")
-        error.why = why
-        raise error from None
+        raise UnreachableError(f"no daemon answers at {endpoint}: {text}", why) from None
 
 
 def _base(mode: str) -> dict[str, object]:

@@ -245,14 +245,15 @@ def rate(board: Board) -> Finding:
     most_s = MAX_REPLY_PERIOD_S
     rare, period = slow and gap_s > most_s, min(float(f"{gap_s:.1g}"), most_s)
     keys: dict[str, object] = {"mcu.reply_period": period if slow else configured}
+    outcome: outcomes.Outcome = "reply rate: right"
+    if rare:
+        outcome = "reply rate: rare"
+    elif slow:
+        outcome = "reply rate: slow"
+    elif lossy:
+        outcome = "reply rate: lossy"
     return outcomes.find(
-        "reply rate: rare"
-        if rare
-        else "reply rate: slow"
-        if slow
-        else "reply rate: lossy"
-        if lossy
-        else "reply rate: right",
+        outcome,
         keys if 3 * gap_s > 1.1 * unset_s and not rare else {},
         rate=1 / gap_s,
         way="by its own clock" if board.own_clock else "as answers to lines",

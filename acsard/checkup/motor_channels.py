@@ -213,14 +213,15 @@ def wheel_map(mcu: McuConfig, channels: Sequence[Channel]) -> Finding:
         entries[wheel] = f"{'+' if sign > 0 else '-'}{letter}"
     names = WHEEL_ANSWERS[len(channels)].values()
     wrong = [wheel for wheel in names if entries[wheel] != getattr(mcu.wheels, wheel)]
+    outcome: outcomes.Outcome = "wheel map: right"
+    if wrong:
+        outcome = "wheel map: other"
+    elif faulty:
+        outcome = "wheel map: faulty"
+    elif unseen:
+        outcome = "wheel map: partly"
     return outcomes.find(
-        "wheel map: other"
-        if wrong
-        else "wheel map: faulty"
-        if faulty
-        else "wheel map: partly"
-        if unseen
-        else "wheel map: right",
+        outcome,
         {} if faulty else {f"mcu.wheels.{wheel}": entries[wheel] for wheel in names},
         map=" ".join(entries[wheel] for wheel in names),
         wheels=", ".join(map(with_spaces, wrong)),

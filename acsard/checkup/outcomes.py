@@ -104,15 +104,15 @@ WARN? reply times: bunched | p50 {middle:.0f} ms, p99 {high:.0f} ms, max {longes
     {share:.0%} of the replies come in bunches behind silences of up to {longest:.0f} ms, so the
     pose is less certain, and commands may wait as long: either the firmware's loop waits, or a USB
     adapter, a hub or their driver holds the bytes back
-    -> try another USB port without a hub (`acsard doctor` checks the latency_timer of an adapter).
-    If the bunches stay: which library, delay() or print in the loop takes so long? Let the loop
-    never wait
+    -> try another USB port without a hub; for a slow FTDI adapter `acsard doctor` prints the
+    command. If the bunches stay: which library, delay() or print in the loop takes so long? Let the
+    loop never wait
 
 PASS round trip: right | p50 {middle:.1f} ms, max {longest:.1f} ms
 WARN? round trip: slow | p50 {middle:.1f} ms, max {longest:.1f} ms
     the wheel speeds arrive late
-    -> does the firmware wait? an FTDI chip waits for 16 ms unless its latency_timer is 1
-    (`acsard doctor` checks it)
+    -> does the firmware wait? an FTDI chip waits for 16 ms unless its latency_timer is 1: if it is
+    not, `acsard doctor` prints the command
 SKIPPED round trip: own clock
     the board reports by its own clock, so its replies do not answer single lines
 SKIPPED? round trip: none
@@ -279,7 +279,8 @@ FAIL top speed: overflow | {most:.1f} at {speed:.1f} rad/s
     edges of the encoders at this speed, or the motor does turn backward
     -> watch the wheel. If it turns forward, compute and send speeds in a wider type (float, or 32
     bits), and count the edges in hardware, or fewer per turn; if not, check the driver and its
-    supply. Until then lower the limits, so that no wheel turns faster than {below:.1f} rad/s
+    supply. Until then lower the limits, so that no wheel turns faster than {below:.1f} rad/s, which
+    is {below_linear:.2f} m/s at the wheel
 FAIL top speed: backward | {most:.1f} at {speed:.1f} rad/s
     alone this motor or these turned forward as commanded, but together they are reported backward:
     {motors}. Either lines or a driver reversed them meanwhile, or their encoders disturb each other

@@ -65,6 +65,7 @@ def finding(
         most=means[worst],
         speed=speed,
         below=passed,
+        below_linear=passed * radius,
         motors=motor_names(board.mcu, slow or [worst], ", "),
     )
 

@@ -86,18 +86,14 @@ def _judged(least_s: float, most_s: float) -> Finding:
     # The measurement is not more accurate than 0.01 s.
     least_s, most_s = round(least_s, 2), round(most_s, 2)
     beyond_s = least_s - motion.MAX_WATCHDOG_S
-    return outcomes.find(
-        "watchdog: late"
-        if beyond_s > 0
-        else "watchdog: early"
-        if most_s < motion.MIN_WATCHDOG_S
-        else "watchdog: unclear"
-        if most_s > motion.MAX_WATCHDOG_S
-        else "watchdog: right",
-        figure=figure,
-        seconds=middle_s,
-        margin_s=max(0.0, beyond_s),
-    )
+    outcome: outcomes.Outcome = "watchdog: right"
+    if beyond_s > 0:
+        outcome = "watchdog: late"
+    elif most_s < motion.MIN_WATCHDOG_S:
+        outcome = "watchdog: early"
+    elif most_s > motion.MAX_WATCHDOG_S:
+        outcome = "watchdog: unclear"
+    return outcomes.find(outcome, figure=figure, seconds=middle_s, margin_s=max(0.0, beyond_s))
 
 
 def measured(board: Board, motors: Sequence[int], stop: Run) -> Bounds:

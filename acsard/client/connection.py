@@ -82,9 +82,8 @@ def open_connection(where: Address, source: str = "app") -> Iterator[Connection]
     try:
         session = client_session(where.endpoint, where.tls)
     except UnreachableError as error:
-        advised = UnreachableError("; ".join(filter(None, (str(error), where.advice))))
-        advised.why = error.why
-        raise advised from None
+        text = "; ".join(filter(None, (str(error), where.advice)))
+        raise UnreachableError(text, error.why) from None
     connection = Connection(session, where.robot_id, source, where.tls, where.endpoint)
     end_at_exit(connection)
     try:

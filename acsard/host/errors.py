@@ -36,7 +36,10 @@ class MendableError(AcsardError):
     """An error whose cause a person can fix. Its text says how."""
 
     code: Exit = Exit.FAILURE  # exit code of a subcommand that ends with this error
-    why: Reason | None = None  # the finding that its text says, if it has a code
+
+    def __init__(self, text: str, why: Reason | None = None) -> None:
+        super().__init__(text)
+        self.why = why  # the finding that its text says, if it has a code
 
 
 class UsageError(MendableError, ValueError):

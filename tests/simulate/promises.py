@@ -15,7 +15,7 @@ from collections import Counter, deque
 from typing import Any, get_args
 
 from acsard.core.tables.link_codes import LinkCode
-from acsard.core.tables.motor_codes import GUARD_CODES, FaultCode
+from acsard.core.tables.motor_codes import GUARD_DEFECTS, FaultCode
 from acsard.core.tables.sender_codes import WaitCode
 from acsard.core.tables.stop_codes import StopCode
 from tests.simulate.ages import MARGIN_NS, Ages, Sender, Wish
@@ -488,7 +488,7 @@ class Witness:
             return
         if code not in CODES.get(mode, ()) or not reason:
             raise BrokenError("every state has a reason", at_ns, f"{mode}: {code}: {reason!r}")
-        if code in GUARD_CODES:
+        if code in GUARD_DEFECTS:
             raise BrokenError("the guard never has to trip", at_ns, reason)
         if mode == "fault" != self.mode:
             self.counts["fault"] += 1

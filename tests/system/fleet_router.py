@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import tomllib
+from collections.abc import Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
@@ -12,7 +13,16 @@ import zenoh
 
 from acsard.machine.authority import Authority
 from acsard.machine.router_file import router_file
-from tests.system.harness import ROOT, Answered, Bus, Daemon, Program, acsard, client_config
+from tests.system.harness import (
+    ROOT,
+    Answered,
+    Bus,
+    Daemon,
+    Program,
+    acsard,
+    client_config,
+    until,
+)
 from tests.system.identities import free_tls_endpoint
 from tests.system.strangers import command_line
 
@@ -73,10 +83,17 @@ def tls_settings(own: Path) -> dict[str, object]:
     }
 
 
-def for_two(where: Path) -> Path:
-    """Write the router file for both test robots, as `acsard tls router` creates it."""
+def secured_config(endpoint: str, own: Path) -> zenoh.Config:
+    """Return the manual's settings for all languages, with the certificate in `own`."""
+    config = client_config(endpoint)
+    config.insert_json5("transport/link/tls", json.dumps(tls_settings(own)))
+    return config
+
+
+def file_for(where: Path, robots: Sequence[str] = ROBOTS) -> Path:
+    """Write the router file for these robots, as `acsard tls router` creates it."""
     file = where / "router.json5"
-    file.write_text(router_file(ROUTER_FILE.read_text(), ROBOTS, {}))
+    file.write_text(router_file(ROUTER_FILE.read_text(), robots, {}))
     return file
 
 
@@ -118,13 +135,19 @@ def robot_at(endpoint: str, where: Path, robot_id: str, mode: str = "client", **
 
 def router(where: Path, endpoint: str) -> Program:
     """Run a router with the Zenoh library of Python. It prints "routing" when it is ready."""
-    file = for_two(where)
+    file = file_for(where)
     return Program(command_line(_ROUTER, file, json.dumps(_changes(file, where, endpoint))), where)
 
 
-def acsard_router(where: Path, endpoint: str) -> Program:
-    """Run `acsard router` with that file. Its log says when it listens."""
-    return Program(acsard("router", str(write_local_copy(for_two(where), where, endpoint))), where)
+def acsard_router(where: Path, endpoint: str, robots: Sequence[str] = ROBOTS) -> Program:
+    """Run `acsard router` with that file. `listens` waits until it listens."""
+    file = write_local_copy(file_for(where, robots), where, endpoint)
+    return Program(acsard("router", str(file)), where)
+
+
+def listens(router: Program) -> None:
+    """Wait until `acsard router` listens."""
+    until(lambda: "router_open" in router.stderr, 10.0, f"the router listens\n{router}")
 
 
 class Member(Bus):
@@ -184,9 +207,7 @@ class Fleet:
 
     def config(self, name: str) -> zenoh.Config:
         """Return the manual's settings for all languages, with this certificate."""
-        config = client_config(self.endpoint)
-        config.insert_json5("transport/link/tls", json.dumps(tls_settings(self.where / name)))
-        return config
+        return secured_config(self.endpoint, self.where / name)
 
     def member(self, name: str, robot_id: str = "robot1") -> Member:
         """Connect a client with this certificate to the router."""

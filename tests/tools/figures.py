@@ -33,6 +33,8 @@ from tests.pages import ROOT
 from tests.system.browser import Page
 from tests.system.harness import Daemon, cpu_seconds, resident_kb, until
 from tests.systemd.image import build, needs
+from tests.tools.fleet_figures import fleet
+from tests.tools.link_figures import link
 from tests.tools.reference import table
 
 PAGE = ROOT / "deploy/manual/pages/explanation/figures.md"
@@ -218,6 +220,8 @@ SECTIONS: dict[str, Callable[[Path], str]] = {
     "daemon": daemon,
     "page": page,
     "disk": disk,
+    "fleet": fleet,
+    "link": link,
     "packages": packages,
     "service": service,
     "tests": tests,

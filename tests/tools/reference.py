@@ -289,7 +289,9 @@ def codes() -> str:
         "Codes and advice",
         "`code` in `state`, `sources`, `causes`, events, `diagnostics`, `acsard doctor --json` "
         "and `acsard mcu check --json` says in\none word why the robot does not move, and what "
-        "went wrong. Words in capitals stand for values. `acsard doctor` and\n`acsard echo state "
+        "went wrong. Words in capitals stand for values. Names such as mcu.port are\n[settings]"
+        "(settings.md): the key `port` below `[mcu]` in `acsard.toml`, which for the service is "
+        "`/etc/acsard/acsard.toml`.\n`acsard doctor` and\n`acsard echo state "
         "-n 1 --short` print the text of your robot. `wheel_fault` in `state` is a text, and stops "
         "nothing:\n[when a wheel fails](../explanation/wheels.md).",
         *texts,

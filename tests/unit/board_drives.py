@@ -23,7 +23,6 @@ from acsard.core.link.feedback import Line
 from acsard.core.link.link_output import QUESTION_LINE, Output
 from acsard.core.link.link_setup import LinkSetup
 from acsard.core.link.session import McuSession
-from acsard.core.simulator.vehicle import whole_counts
 from acsard.core.values import AT_REST, NS_PER_S, Instant, Pose, Received, WheelSpeeds
 from tests.unit.odometer import Odometer, arc
 
@@ -169,7 +168,8 @@ class Host:
         # The edges of the encoders are not at the same angles.
         edges = zip(wheels, (0.0, 0.6, 0.1, 0.4), strict=False)
         return tuple(
-            whole_counts(angle, per_turn, edge) * math.tau / per_turn for angle, edge in edges
+            math.floor(angle / math.tau * per_turn + edge) * math.tau / per_turn
+            for angle, edge in edges
         )
 
     # the path to the host

@@ -28,7 +28,7 @@ from acsard.core.motion.wheels import (
     count_angle,
     new_wheels,
 )
-from acsard.core.simulator.vehicle import approach, whole_counts
+from acsard.core.simulator.vehicle import approach
 from acsard.core.values import WHEELS, Motion, Twist, Wheels4, WheelSpeeds
 from tests.wheels import FOUR
 
@@ -124,7 +124,7 @@ class Bench:
         self.now = 0.0
         self.speeds = [0.0] * self.driven
         self.angles = [dice.uniform(0.0, self.unit) for _ in self.speeds]
-        self.counted = [whole_counts(angle, robot.counts, 0.0) for angle in self.angles]
+        self.counted = [math.floor(angle / math.tau * robot.counts) for angle in self.angles]
         self.lags = [robot.lag * dice.uniform(0.9, 1.1) for _ in self.speeds]
         self.sizes = [dice.uniform(0.985, 1.015) for _ in self.speeds]
         self.gain = 1.0  # slopes and bumps
@@ -175,7 +175,7 @@ class Bench:
             self.angles[i] += moved
             if i in self.keeps:
                 self.excess += (moved - told[i] * dt) * self.robot.radius / len(self.keeps)
-            counted = whole_counts(self.angles[i], self.robot.counts, 0.0)
+            counted = math.floor(self.angles[i] / math.tau * self.robot.counts)
             counts, self.counted[i] = counted - self.counted[i], counted
             counts = 0 if i in self.dead else counts * self.signs.get(i, 1)
             speeds[i] = self.frozen.get(i, round(counts * self.unit / dt, 2))

@@ -19,6 +19,7 @@ from acsard.machine.service_installation import (
     GROUP,
     INSTALL_COMMANDS,
     KEPT_BY_REMOVAL,
+    PACKAGE_UNIT_DIRECTORY,
     PAGE,
     PRIVATE,
     PROGRAM,
@@ -161,6 +162,7 @@ def test_an_installation_beside_another_version_names_the_upgrade_that_can_go_ba
 ) -> None:
     (tmp_path / "current").symlink_to(used)
     monkeypatch.setattr(versions.current, "__defaults__", (tmp_path,))
+    monkeypatch.setattr(versions, "HOME", tmp_path)
     monkeypatch.setattr(service_installation, "UNIT_DIRECTORY", tmp_path)
     assert main(["service", "install", "--dry-run"]) == 0
     text = f"the service runs version {used}; to change to this one, type `acsard service upgrade "
@@ -178,6 +180,7 @@ def _machine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     for name, value in {
         "KEPT_BY_REMOVAL": kept, "PRIVATE": tuple(map(below, PRIVATE)), "RULES": below(RULES),
         "UNIT_DIRECTORY": below(UNIT_DIRECTORY), "COMMAND": below(COMMAND),
+        "PACKAGE_UNIT_DIRECTORY": below(PACKAGE_UNIT_DIRECTORY),
     }.items():  # fmt: skip
         monkeypatch.setattr(service_installation, name, value)
     monkeypatch.setattr(versions, "HOME", below(versions.HOME))

@@ -14,7 +14,7 @@ from typing import cast
 from msgspec import Struct
 from msgspec.structs import replace
 
-from acsard.core.codes import Code, Reason, reason, sentence
+from acsard.core.codes import CODES, Code, Reason, reason, sentence
 from acsard.core.config.settings import Config
 from acsard.core.config.wire_time import wire_use
 from acsard.core.formatting import many
@@ -46,7 +46,7 @@ from acsard.core.motion.emergency_stop import (
 from acsard.core.motion.gyro import STATUS
 from acsard.core.tables.finding_table import LEVELS
 from acsard.core.tables.link_codes import HOST_CODES
-from acsard.core.tables.motor_codes import GUARD_CODES
+from acsard.core.tables.motor_codes import GUARD_DEFECTS
 from acsard.core.tables.pose_codes import PoseCode
 from acsard.core.values import (
     GyroDoes,
@@ -82,11 +82,6 @@ PORT_ADVICE = "plug the board in if it is not; `acsard ports` lists the serial p
 ACTIVATE = "if no check runs, type `acsard call activate`"
 
 CLEAR = "then look at the robot, and type `acsard call clear`"
-
-DEFECT = (
-    "this is a defect of acsard: report it with the newest recording (`acsard recording` lists the "
-    f"recordings), {CLEAR}"
-)
 
 
 class Row(Struct, frozen=True):
@@ -145,7 +140,7 @@ def _mode(status: RobotState) -> Row:
     why = Reason(cast("Code", status.code), status.reason)
     if status.mode in HELD:
         clear = f"remove the cause, {CLEAR}"
-        why = replace(why, advice=DEFECT if why.code in GUARD_CODES else clear)
+        why = replace(why, advice=CODES[why.code].advice if why.code in GUARD_DEFECTS else clear)
     return Row("mode", [why], {"mode": status.mode, "source": status.source})
 
 

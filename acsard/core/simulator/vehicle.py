@@ -28,9 +28,9 @@ def approach(speed: RadPerS, goal: RadPerS, dt: Seconds, lag: Seconds) -> tuple[
     return speed if abs(speed) > 1e-9 else 0.0, angle
 
 
-def whole_counts(angle: Rad, per_turn: int, edge: float = 0.5) -> int:
-    """Return what an encoder has counted that had `edge` of a count at 0 rad."""
-    return math.floor(angle / math.tau * per_turn + edge)
+def whole_counts(angle: Rad, per_turn: int) -> int:
+    """Return what an encoder has counted whose 0 rad is in the middle of a count."""
+    return math.floor(angle / math.tau * per_turn + 0.5)
 
 
 class Vehicle:

@@ -193,6 +193,7 @@ WARN port: unknown board
     file to /etc/udev/rules.d
 WARN port: slow
     the FTDI chip of the port delays bytes by {timer} ms
-    -> install deploy/udev/70-acsar.rules, or run as root: echo 1 > {file}
+    -> until the next start of this computer: `echo 1 | sudo tee {file}`; for good, install
+    deploy/udev/70-acsar.rules
 """,
 )

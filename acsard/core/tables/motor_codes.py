@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Literal, get_args
+from typing import Literal
 
 from acsard.core.tables.finding_table import table
 
@@ -12,7 +12,15 @@ GuardCode = Literal[
     "guard_no_command", "guard_too_long",
 ]  # fmt: skip
 
-GUARD_CODES: tuple[GuardCode, ...] = get_args(GuardCode)
+GUARD_DEFECTS: dict[GuardCode, str] = {
+    "guard_line_damaged": "is not complete, or does not have the speed of each wheel",
+    "guard_too_fast": "moves a wheel faster than limits.wheel_speed",
+    "guard_no_link": "moves a wheel while the serial link is not up",
+    "guard_no_checksum": "moves a wheel without the checksum that mcu.link_check requires",
+    "guard_no_command": "speeds up a wheel although no command is fresh, or although the mode is "
+    "not driving",
+    "guard_too_long": "still moves a wheel although the longest ramp to zero has ended",
+}
 
 # Causes of a latched fault.
 FaultCode = Literal[
@@ -68,36 +76,6 @@ WARN wheel_slow
 WARN wheel_fast
     {wheel} wheel reaches {share} of its expected speed:
     -> check the speed controller of the board and feedback.response_time
-FAIL guard_line_damaged
-    the daemon's guard replaced a line for the board with zeros: the line is not complete, or does
-    not have the speed of each wheel
-    -> this is a defect of acsard: keep the recording of this moment (`acsard recording`) and report
-    it; then type `acsard call clear`
-FAIL guard_too_fast
-    the daemon's guard replaced a line for the board with zeros: the line moves a wheel faster than
-    limits.wheel_speed
-    -> this is a defect of acsard: keep the recording of this moment (`acsard recording`) and report
-    it; then type `acsard call clear`
-FAIL guard_no_link
-    the daemon's guard replaced a line for the board with zeros: the line moves a wheel while the
-    serial link is not up
-    -> this is a defect of acsard: keep the recording of this moment (`acsard recording`) and report
-    it; then type `acsard call clear`
-FAIL guard_no_checksum
-    the daemon's guard replaced a line for the board with zeros: the line moves a wheel without the
-    checksum that mcu.link_check requires
-    -> this is a defect of acsard: keep the recording of this moment (`acsard recording`) and report
-    it; then type `acsard call clear`
-FAIL guard_no_command
-    the daemon's guard replaced a line for the board with zeros: the line speeds up a wheel although
-    no command is fresh, or although the mode is not driving
-    -> this is a defect of acsard: keep the recording of this moment (`acsard recording`) and report
-    it; then type `acsard call clear`
-FAIL guard_too_long
-    the daemon's guard replaced a line for the board with zeros: the line still moves a wheel
-    although the longest ramp to zero has ended
-    -> this is a defect of acsard: keep the recording of this moment (`acsard recording`) and report
-    it; then type `acsard call clear`
 OK wheels_obey
     every wheel obeys its command
 WARN wheel_fault | wheel fault
@@ -106,5 +84,14 @@ WARN wheel_fault | wheel fault
 WARN no_encoders
     {fault}
     -> if the robot has encoders, set feedback.encoders = true
-""",
+"""
+    + "".join(
+        f"""
+FAIL {code}
+    the daemon's guard replaced a line for the board with zeros: the line {defect}
+    -> this is a defect of acsard: report it with the newest recording (`acsard recording` lists the
+    recordings), then look at the robot, and type `acsard call clear`
+"""
+        for code, defect in GUARD_DEFECTS.items()
+    ),
 )
