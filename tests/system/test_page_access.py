@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import json
 import re
-import socket
 import ssl
 import time
 from contextlib import suppress
@@ -123,18 +122,6 @@ async def test_a_link_with_fewer_permissions_replaces_a_cookie_only_if_asked_to(
         assert await opens("viewer", replace=True) == (303, "viewer")
         page.vault.revoke("my-viewer")
         assert await opens("operator") == (303, "operator")
-
-
-def test_a_client_that_leaves_before_the_end_of_its_body_leaves_no_traceback(
-    page: Page, bus: Bus
-) -> None:
-    port = int(page.here.rpartition(":")[2])
-    head = f"POST /api/srv/stop HTTP/1.1\r\nHost: 127.0.0.1:{port}\r\nContent-Length: 9\r\n\r\n"
-    with socket.create_connection(("127.0.0.1", port), 30.0) as connection:
-        connection.sendall(head.encode())
-        time.sleep(0.1)
-    until(lambda: bus.state()["mode"] == "stopped", 10.0, "the robot stops")
-    assert "Traceback" not in page.stderr
 
 
 async def test_a_driver_whose_token_is_revoked_learns_why_within_a_second_and_the_robot_stops(
