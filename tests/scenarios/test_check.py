@@ -107,6 +107,22 @@ def test_old_firmware_is_never_driven_on_a_checked_link_and_the_reason_names_the
 # damage
 
 
+@pytest.mark.variations(3)
+@pytest.mark.parametrize("every", [2, 3, 7])
+@four_and_two
+def test_bit_errors_both_ways_change_no_speed(every: int, wheels: WheelMap) -> None:
+    world = started(config("on", 3200, wheels=wheels))
+    world.drive(0.4, seconds=0.5)
+    set_points: set[float] = set()
+    with world.mcu.fault("bit_errors", every):
+        for _ in range(200):
+            world.hold(0.4, seconds=0.01, hz=100.0)
+            set_points.update(world.mcu.vehicle.set_points)
+            assert all(abs(speed) < 8.5 for speed in world.state.wheels)
+    assert max(set_points) <= 8.0
+    assert min(set_points) >= 0.0
+
+
 # counts
 
 

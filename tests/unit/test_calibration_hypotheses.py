@@ -114,6 +114,7 @@ FOUR = ("fl", "fr", "rl", "rr")
 SLOW = motion([(2, 0, 0), *[(6, v, w) for v, w in ((0.1, 0), (0, 0.4), (-0.1, 0), (0, -0.4))] * 3])
 
 
+@pytest.mark.variations(3)
 @pytest.mark.parametrize("wheels", [("left", "right"), FOUR])
 @pytest.mark.parametrize("counts", [16, 32, 96, 360, 3200])
 def test_coarse_encoders_are_no_two_series(counts: int, wheels: tuple[str, ...]) -> None:
