@@ -614,13 +614,6 @@ def test_the_manual_has_every_ros_key_with_its_default() -> None:
         assert re.search(rf"^{field.name} = {re.escape(default)}( |$)", text, re.M), field.name
 
 
-def test_the_manual_names_every_topic_and_service() -> None:
-    text = manual("reference/ros")
-    for row in ros_names():
-        if not row.type.startswith("rcl_interfaces/"):
-            assert f"`{row.name}`" in text, row.name
-
-
 def test_the_manual_starts_a_bridge_over_the_network_below_the_robot_s_namespace() -> None:
     """Over the network each robot has a namespace.
 

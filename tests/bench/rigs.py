@@ -8,7 +8,6 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
 
 from msgspec.structs import replace
 
@@ -32,19 +31,6 @@ POLLED = (sys.executable, "-m", "tests.bench.polled")
 
 DRAINING = (*POLLED, "--drain")
 """The polled driver with its obvious fix."""
-
-
-def trees() -> dict[str, Sequence[str]]:
-    """Return the command lines that start acsard from this checkout and from other checkouts.
-
-    $ACSARD_BESIDE lists the directories of the other checkouts, separated like those in PATH.
-    """
-    others = os.environ.get("ACSARD_BESIDE")
-    named = [Path(other) for other in others.split(os.pathsep)] if others else []
-    return {"acsard": ACSARD} | {
-        other.name: ("env", f"PYTHONPATH={other}", sys.executable, "-P", *ACSARD[1:])
-        for other in named
-    }
 
 
 def config() -> Config:
@@ -75,25 +61,6 @@ def sibling(settings: Config, number: int) -> Config:
     return replace(settings, robot=name, bus=bus)
 
 
-# Settings that the polled program reads, so their defaults are written too.
-READ = {("mcu", "baud_rate"), ("control", "rate")}
-
-
-def chosen(settings: Config) -> dict[str, Any]:
-    """Return the settings that are not the defaults: another checkout may not know the others."""
-    usual: dict[str, Any] = effective(Config())
-    tables: dict[str, Any] = effective(settings)
-    changed = {
-        name: {
-            key: value
-            for key, value in table.items()
-            if (name, key) in READ or value != usual[name][key]
-        }
-        for name, table in tables.items()
-    }
-    return {name: table for name, table in changed.items() if table}
-
-
 @contextmanager
 def rig(
     settings: Config,
@@ -102,7 +69,7 @@ def rig(
     """Start a program and a simulated board. The body runs when the link between them is up."""
     with TemporaryDirectory(prefix="acsard-bench-") as where:
         file = Path(where) / "acsard.toml"
-        file.write_text("\n".join(document(chosen(settings))) + "\n", encoding="utf-8")
+        file.write_text("\n".join(document(effective(settings))) + "\n", encoding="utf-8")
         with Rig(settings, file, words) as running:
             yield running
 

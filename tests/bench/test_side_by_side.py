@@ -4,8 +4,7 @@
 
 Latency: the programs run one after the other on the same rig. Processor time: each program runs at
 the same time as the polled one, so that other programs of the machine slow both equally. The test
-prints the figures, and asserts only ratios and counts. With ACSARD_BESIDE=DIRECTORY:DIRECTORY it
-also measures the acsard of other checkouts.
+prints the figures, and asserts only ratios and counts.
 
 The polled program (`polled.py`) acts only at its 100 Hz tick, so a command waits half a period on
 average. After one late reply it always reads the line before the newest one. Its option `--drain`
@@ -23,7 +22,7 @@ from statistics import median
 import pytest
 
 from tests.bench.matching import staircase
-from tests.bench.rig import SPACING_S
+from tests.bench.rig import ACSARD, SPACING_S
 from tests.bench.rigs import (
     DRAINING,
     POLLED,
@@ -33,7 +32,6 @@ from tests.bench.rigs import (
     rig,
     share,
     sibling,
-    trees,
     waits_us,
 )
 
@@ -72,7 +70,7 @@ def times_as_long(what: str, ratio: list[list[float]], other: list[list[float]])
 
 
 def test_commands_and_feedback_are_many_times_faster_than_polled() -> None:
-    ways = trees() | {"polled": POLLED, "polled, draining": DRAINING}
+    ways = {"acsard": ACSARD, "polled": POLLED, "polled, draining": DRAINING}
     waits: Turns = {name: [] for name in ways}
     delays: Turns = {name: [] for name in ways}
     for number in range(ROUNDS):
@@ -114,19 +112,12 @@ def test_what_a_commanded_robot_costs_at_the_same_time_as_polled() -> None:
     Each command has another speed, so the daemon decides about each one. A sender that repeats a
     speed costs less, so do not compare a ratio that was measured with it.
     """
-    ways = trees()
-    pairs: dict[str, list[tuple[float, float]]] = {name: [] for name in ways}
-    for number in range(PAIRS):
-        for name, words in ways.items():
-            pairs[name].append(shares_of_a_pair(words, number))
-    print(f"\none subscriber, {1 / SPACING_S[1]:.0f} to {1 / SPACING_S[0]:.0f} commands a second:")
-    ratios = {}
-    for name, shares in pairs.items():
-        by_pair = sorted(ours / theirs for ours, theirs in shares)
-        ratios[name] = median(by_pair)
-        ours, theirs = (100 * median(column) for column in zip(*shares, strict=True))
-        print(
-            f"  {name:10}{ours:5.1f} % of a core beside {theirs:.1f} %, {ratios[name]:.2f} times "
-            f"polled ({len(shares)} pairs, from {by_pair[0]:.2f} to {by_pair[-1]:.2f})"
-        )
-    assert ratios["acsard"] < 5.0
+    pairs = [shares_of_a_pair(ACSARD, number) for number in range(PAIRS)]
+    by_pair = sorted(ours / theirs for ours, theirs in pairs)
+    ours, theirs = (100 * median(column) for column in zip(*pairs, strict=True))
+    print(
+        f"\none subscriber, {1 / SPACING_S[1]:.0f} to {1 / SPACING_S[0]:.0f} commands a second: "
+        f"{ours:.1f} % of a core beside {theirs:.1f} %, {median(by_pair):.2f} times polled "
+        f"({PAIRS} pairs, from {by_pair[0]:.2f} to {by_pair[-1]:.2f})"
+    )
+    assert median(by_pair) < 5.0

@@ -81,14 +81,6 @@ def test_contacts_are_reported_ten_times_a_second_and_values_once(inputs: Inputs
     assert [status for status in statuses if status.estop is None] == [values] * 10
 
 
-@pytest.mark.parametrize("pressed", [False, True])
-def test_no_contact_is_reported_before_its_state_is_known(inputs: Inputs, pressed: bool) -> None:
-    """If the board reported a press too early at boot, the robot would wait for a `clear`."""
-    assert inputs.lines(CLOSED ^ pressed, 19) == []
-    assert inputs.stopped == pressed
-    assert inputs.lines(CLOSED ^ pressed, 1) == [BoardStatus(estop=pressed, bumpers=(False,) * 4)]
-
-
 @given(st.lists(st.tuples(st.booleans(), st.integers(1, 25)), max_size=12))
 def test_a_contact_is_released_only_by_20_free_samples_and_pressed_by_three(
     build: Build, runs: list[tuple[bool, int]]
@@ -156,23 +148,6 @@ def test_the_driver_fault_input_can_be_active_low_or_active_high(build: Build, h
     fault = 0b100000 if high else 0
     assert inputs.lines(fault ^ 0b100000, 1000) == [BoardStatus(driver_fault=False)]
     assert inputs.lines(fault, 1000) == [BoardStatus(driver_fault=True)]
-
-
-@given(st.integers(0, 1023), st.integers(0, 1023))
-def test_volts_and_amperes_are_those_of_the_divider_and_the_sensor(
-    build: Build, battery: int, current: int
-) -> None:
-    """Compare with an independent calculation for the divider and the current sensor.
-
-    The divider is 10 kilohms of 66. The sensor gives 40 mV per ampere around 2.5 V.
-    """
-    inputs = Inputs(build(*ALL_INPUTS))
-    inputs.sample(CLOSED, (battery, current))
-    inputs.milliseconds = 1000
-    status = inputs.line()
-    assert status is not None
-    assert status.volts == pytest.approx(battery * 5 / 1024 * 6.6, abs=0.006)
-    assert status.amps == pytest.approx((current * 5 / 1024 - 2.5) / 0.04, abs=0.006)
 
 
 def test_the_volts_are_the_mean_of_a_second(build: Build) -> None:

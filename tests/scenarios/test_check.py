@@ -78,14 +78,6 @@ def test_a_new_mcu_is_driven_with_checked_lines(wheels: WheelMap) -> None:
     assert set(world.state.counters) <= {"lines", "lines_sent", "commands"}
 
 
-@four_and_two
-def test_a_new_mcu_is_driven_with_samples_when_counts_are_configured(wheels: WheelMap) -> None:
-    world = started(config(counts=3200, wheels=wheels))
-    world.drive(0.5, seconds=1.0)
-    assert check_of(world) == "checked with samples"
-    assert all(b"S*" in line for line in moving(world.lines()))
-
-
 OLD_FIRMWARE = pytest.mark.parametrize(
     ("firmware", "comma"), [("no_check", False), ("plain_only", False), ("comma_latched", True)]
 )

@@ -15,7 +15,6 @@ import re
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, redirect_stdout
-from datetime import datetime
 from pathlib import Path
 from typing import NamedTuple
 
@@ -31,9 +30,8 @@ from acsard.core.incoming.commands import Arrival
 from acsard.core.incoming.queries import Query
 from acsard.core.simulator import protocol
 from acsard.core.values import NS_PER_S, BatteryLevel, Cause, Latches
-from acsard.host.errors import Exit
 from acsard.recording import recorder as module
-from acsard.recording.file import MAGIC, FrameWriter, listed
+from acsard.recording.file import FrameWriter
 from acsard.recording.recorder import Recorder
 from tests.scenarios.speakers import Speaker, over
 from tests.scenarios.world import World, naming
@@ -354,34 +352,3 @@ def test_the_three_outputs_have_the_same_lines_at_the_same_times(story: Story) -
             abs(entry.seconds - other.seconds) for entry, other in zip(lines, show, strict=True)
         ]
         assert max(apart) < 0.002, output
-
-
-@pytest.mark.parametrize(("begin", "end"), [(18.5, 19.5), (7.0, 9.7), (-40_000.0, 6.0)])
-def test_show_and_export_of_a_part_have_the_same_lines(
-    begin: float, end: float, story: Story, tmp_path: Path
-) -> None:
-    new = tmp_path / "new.mcap"
-    times = [datetime.fromtimestamp(NINE / 1e9 + at).isoformat() for at in (begin, end)]
-    words = ["--from", times[0], "--to", times[1], "--directory", str(story.where)]
-    show = shown_lines(*words)
-    assert len(show) > 1
-    # The first argument is a file.
-    first = str(listed(story.where)[1 if begin > 0 else 0])
-    del words[4:]
-    assert main(["recording", "export", first, str(new), *words]) == 0
-    assert [line.text for line in log_of(new)] == [line.text for line in shown_lines(first, *words)]
-
-
-def test_show_and_export_of_a_damaged_recording_have_the_same_lines(
-    story: Story, tmp_path: Path
-) -> None:
-    bad, new = tmp_path / "bad.rec.zst", tmp_path / "new.mcap"
-    data = bytearray(listed(story.where)[1].read_bytes())
-    _, begin, end, *_ = [found.start() for found in re.finditer(re.escape(MAGIC), data)]
-    data[(begin + end) // 2] ^= 0xFF
-    bad.write_bytes(data)
-    assert main(["recording", "export", str(bad), str(new)]) == Exit.INCOMPLETE
-    show = shown_lines(str(bad))
-    (gap,) = [number for number, line in enumerate(show) if line.text.startswith("gap: ")]
-    assert len(show) - gap > 5
-    assert [line.text for line in log_of(new)] == [line.text for line in show]

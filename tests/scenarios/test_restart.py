@@ -11,6 +11,7 @@ import random
 import pytest
 
 from acsard.core.config.settings import Config
+from acsard.core.messages.schema import DiagnosticArray, DiagnosticStatus
 from acsard.core.messages.signature import public_name
 from acsard.core.robot import Robot
 from acsard.core.values import NS_PER_S, Cause, Event, Instant, Latches
@@ -19,7 +20,6 @@ from acsard.daemon.latch_file import Keeper, LatchFileError, decode, encode, unr
 from acsard.daemon.publication import Publication
 from tests.each import each
 from tests.scenarios.speakers import Speaker, moved
-from tests.scenarios.test_state import row
 from tests.scenarios.world import SIGNED, START, World
 
 ZEROS_S, CYCLE_S = 0.3, 2.0
@@ -85,6 +85,14 @@ class Host:
             self._phase = (self._phase + 0.05) % CYCLE_S
             self.patrol.send(0.0 if self._phase < ZEROS_S else 0.5)
             self.world.run(0.05)
+
+
+def row(world: World, name: str) -> DiagnosticStatus:
+    """Return the row of `diagnostics` with this name."""
+    message = world.loop.publication.current("diagnostics")
+    assert isinstance(message, DiagnosticArray)
+    (row_status,) = [status for status in message.status if status.name == f"acsard: {name}"]
+    return row_status
 
 
 def test_a_robot_whose_latch_file_is_cut_off_starts_stopped() -> None:

@@ -7,7 +7,6 @@ to do. It shows that these steps are enough, and that the robot stays at rest af
 
 from __future__ import annotations
 
-import random
 import re
 from functools import partial
 from pathlib import Path
@@ -349,24 +348,6 @@ def test_a_tool_drives_after_what_the_page_says_and_not_before(
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("road", ["rmw", "bridge"])
-@pytest.mark.parametrize("smoother", [True, False])
-def test_each_goal_after_the_first_drives_with_its_first_speed(smoother: bool, road: Road) -> None:
-    """The first one of rmw waits for a timeout longer, because its clock is new."""
-    world, dice = World(), random.Random(f"goals {road} {smoother}")
-    tool = Nav2(world, road, smoother=smoother)
-    tool.use(None, PAUSES[ALONE][road])
-    for number in range(8):
-        since_ns, pause_s = world.now_ns, dice.uniform(5.0, 60.0)
-        tool.use(FAST, 0.05 if number or road == "bridge" else 0.3)
-        assert moved(world, since_ns)
-        tool.use(FAST, dice.uniform(1.0, 5.0))
-        assert world.state.mode == "driving"
-        tool.use(*NAV2_GOAL[1:])
-        tool.use(None, pause_s)
-
-
-@pytest.mark.slow
 @pytest.mark.parametrize(("road", "first_s"), [("rmw", 61.0), ("bridge", 10.0)])
 def test_the_first_goal_drives_if_the_silence_before_it_lasted_for_the_lease(
     road: Road, first_s: float
@@ -430,8 +411,6 @@ class Recorded(NamedTuple):
     """What a real Nav2 published on `cmd_vel` after an event, and when the robot drove then."""
 
     event: Literal["restart", "clear"]
-    row: str
-    """The first words of the row for it in the table of the page howto/nav2."""
     parts: list[tuple[float | None, float, float]]
     """Speed (None: nothing), Hz and s of each part. A speed follows them."""
     after_s: float | None
@@ -441,32 +420,27 @@ class Recorded(NamedTuple):
 ZEROS_HZ = 5.0
 """The rate of collision_monitor's zeros while its scan is invalid, because TF stops."""
 
-TABLE = SPEEDS, ZEROS, RESTED, AGAIN = "speeds", "zeros, and", "a zero, and", "the path again"
 FOLLOWED = (0.5, 20.0, 8.0)
 END = (0.0, 20.0, 0.05)
 
 RECORDED = {
-    "a filter's zeros": Recorded("restart", RESTED, [(0.0, ZEROS_HZ, 1.8), (None, 1.0, 1.3)], 3.1),
+    "a filter's zeros": Recorded("restart", [(0.0, ZEROS_HZ, 1.8), (None, 1.0, 1.3)], 3.1),
     "the last of a filter's zeros": Recorded(
-        "restart", RESTED, [(0.0, ZEROS_HZ, 0.2), (None, 1.0, 1.3)], 1.5
+        "restart", [(0.0, ZEROS_HZ, 0.2), (None, 1.0, 1.3)], 1.5
     ),
-    "no zero": Recorded("restart", SPEEDS, [(None, 1.0, 1.3)], None),
+    "no zero": Recorded("restart", [(None, 1.0, 1.3)], None),
     "zeros without a second of rest": Recorded(
-        "restart", ZEROS, [(0.5, 20.0, 3.0), (0.0, ZEROS_HZ, 0.8)], None
+        "restart", [(0.5, 20.0, 3.0), (0.0, ZEROS_HZ, 0.8)], None
     ),
-    "the path is sent again": Recorded("clear", AGAIN, [FOLLOWED, END, (None, 1.0, 1.3)], 9.4),
+    "the path is sent again": Recorded("clear", [FOLLOWED, END, (None, 1.0, 1.3)], 9.4),
     "the path is sent again later": Recorded(
-        "clear", AGAIN, [(0.5, 20.0, 12.0), END, (None, 1.0, 2.0)], 14.1
+        "clear", [(0.5, 20.0, 12.0), END, (None, 1.0, 2.0)], 14.1
     ),
-    "the path is sent again at once": Recorded(
-        "clear", ZEROS, [FOLLOWED, END, (None, 1.0, 0.6)], None
-    ),
-    "the controller waits in mid-goal": Recorded(
-        "clear", RESTED, [FOLLOWED, (0.0, 20.0, 1.2)], 9.3
-    ),
-    "a gap in mid-goal": Recorded("clear", SPEEDS, [FOLLOWED, (None, 1.0, 1.3)], None),
+    "the path is sent again at once": Recorded("clear", [FOLLOWED, END, (None, 1.0, 0.6)], None),
+    "the controller waits in mid-goal": Recorded("clear", [FOLLOWED, (0.0, 20.0, 1.2)], 9.3),
+    "a gap in mid-goal": Recorded("clear", [FOLLOWED, (None, 1.0, 1.3)], None),
     "a new goal after a cancelled one": Recorded(
-        "clear", RESTED, [(0.0, 20.0, 2.0), (None, 1.0, 3.0)], 5.1
+        "clear", [(0.0, 20.0, 2.0), (None, 1.0, 3.0)], 5.1
     ),
 }
 
@@ -477,7 +451,7 @@ RECORDED = {
 def test_a_goal_under_way_drives_on_after_a_second_of_rest_and_not_before(
     name: str, road: Road
 ) -> None:
-    event, _, parts, after_s = RECORDED[name]
+    event, parts, after_s = RECORDED[name]
     world = World()
     nav2 = Speaker(world, road)
     nav2.key, nav2._sent = "cmd/nav", 5000  # it has run for longer than this daemon
@@ -500,28 +474,3 @@ def test_a_goal_under_way_drives_on_after_a_second_of_rest_and_not_before(
         assert world.state.code == "neutral"
     else:
         assert drove == pytest.approx(after_s, abs=0.3)
-
-
-ONE_PLACE = "starts again by itself"
-
-
-def test_one_page_says_how_long_after_an_event_a_goal_under_way_drives_on() -> None:
-    pages = ROS2.parent / "manual/pages"
-    words = {f"{path.parent.name}/{path.stem}": path.read_text() for path in pages.rglob("*.md")}
-    words["nav2_params"] = (ROS2 / "nav2_params.yaml").read_text().replace("\n# ", " ")
-    assert [name for name, text in words.items() if ONE_PLACE in text] == ["howto/nav2"]
-    said = re.search(r"(\d+) to (\d+) s after", words["howto/nav2"])
-    assert said is not None
-    rows = re.findall(r"^\| ([^|]+) \| (yes|no)\b", words["howto/nav2"], re.M)
-    assert [text.startswith(row) for text, _ in rows for row in TABLE].count(True) == len(rows)
-    for recorded in RECORDED.values():
-        (answer,) = {answer for text, answer in rows if text.startswith(recorded.row)}
-        assert answer == ("no" if recorded.after_s is None else "yes")
-        if recorded.after_s is not None:
-            assert float(said[1]) <= recorded.after_s <= float(said[2]) + 0.5
-    linked = {name for name, text in words.items() if "nav2.md#a-goal-that-is-under-way" in text}
-    behind = ("commands", "emergency-stop", "modes", "restart")
-    begun = ("ros-drive", "stop", "trouble")
-    assert linked == {f"howto/{name}" for name in begun} | {
-        f"explanation/{name}" for name in behind
-    }

@@ -39,8 +39,6 @@ class Stream:
         self.port = int(free_endpoint().rpartition(":")[2])
         self.grey, self.clients = 0, 0
         self.runs, self.silent, self.ends = True, False, False
-        self.more = 0
-        """Bytes by which each picture is larger than it needs to be."""
         self._loop = asyncio.new_event_loop()
         threading.Thread(target=self._loop.run_forever, daemon=True).start()
         asyncio.run_coroutine_threadsafe(self._start(), self._loop).result(5.0)
@@ -60,7 +58,7 @@ class Stream:
         try:
             while not self.ends:
                 if not self.silent:
-                    body = picture(self.grey) + bytes(self.more)
+                    body = picture(self.grey)
                     head = f"--frame\r\nContent-Length: {len(body)}\r\n\r\n".encode()
                     await answer.write(head + body + b"\r\n")
                 self.grey = (self.grey + self.runs) % 256

@@ -108,32 +108,6 @@ while True:
 Prints the time just before each put. On SIGUSR1 it returns to neutral: it sends thirty zeros.
 """
 
-STOP_AND_GO = (
-    _OPEN
-    + """
-config = zenoh.Config()
-config.insert_json5("mode", '"client"')
-config.insert_json5("scouting/multicast/enabled", "false")
-config.insert_json5("connect", json.dumps({
-    "endpoints": [sys.argv[1]], "timeout_ms": -1, "exit_on_failure": False,
-    "retry": {"period_init_ms": 50, "period_max_ms": 100, "period_increase_factor": 1},
-}))
-session, sequence = zenoh.open(config), 0
-while True:
-    speed = 0.0 if time.monotonic() % 1.0 < 0.3 else 0.3
-    sequence += 1
-    session.put(
-        "acsard/acsar/cmd/app",
-        json.dumps({"linear": {"x": speed}, "angular": {"z": 0}}),
-        attachment=json.dumps(
-            {"sender": "patrol", "stamp": time.monotonic_ns(), "sequence": sequence}
-        ),
-    )
-    time.sleep(0.05)
-"""
-)
-"""Sends zeros for 0.3 s every second and 0.3 m/s in between, for ever, also to the next daemon."""
-
 
 HOARDER = (
     _OPEN.replace(

@@ -2,28 +2,19 @@
 
 from __future__ import annotations
 
-import json
 import threading
-import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
 
-import msgspec
 import pytest
-import zenoh
 
 from acsard.client import Client, connect
-from acsard.core.values import NS_PER_S
 from tests.system.browser import Page, hands, run
-from tests.system.harness import Bus, twist, until
+from tests.system.harness import Bus, until
 from tests.system.identities import Gated
 
 pytestmark = pytest.mark.network
-
-AHEAD_NS = NS_PER_S // 50
-ATTACK_S = 1.5
 
 
 @pytest.fixture(scope="module")
@@ -54,52 +45,6 @@ def driving(client: Client, seconds: float) -> Iterator[None]:
         thread.join()
     if failed:
         raise failed[0]
-
-
-def attack(session: zenoh.Session, keys: tuple[str, ...], sender: str) -> None:
-    """Send commands that turn the robot and claim to be the newest ones of `sender`."""
-    end_s, sequence = time.monotonic() + ATTACK_S, 1_000_000
-    while time.monotonic() < end_s:
-        sequence += 1
-        signature = {"sender": sender, "stamp": time.time_ns() + AHEAD_NS, "sequence": sequence}
-        for key in keys:
-            payload = json.dumps(twist(0.0, 1.0))
-            session.put(key, payload, attachment=msgspec.json.encode(signature))
-        time.sleep(0.02)
-
-
-def attacked(robot: Gated, victim: Client, sender: str = "") -> list[Any]:
-    """Let an operator attack the victim while it drives. Return the states during the attack.
-
-    The attack uses this sender id, or the id that `state` publishes if it is empty.
-    """
-    keys = tuple(f"acsard/acsar/cmd/teleop{end}" for end in ("", "/operator", "/maintainer"))
-    with (
-        Bus(robot.plain) as bus,
-        robot.opened("operator") as session,
-        bus.follow("state") as states,
-        driving(victim, ATTACK_S + 3.0),
-    ):
-        until(lambda: (bus.state()["linear"] or 0.0) > 0.15, 10.0, "the victim drives")
-        begun = len(states.seen)
-        attack(session, keys, sender or bus.state()["sender"])
-        return [entry.value for entry in states.seen[begun:]]
-
-
-def test_a_stolen_secret_does_not_take_the_robot_under_another_certificate(robot: Gated) -> None:
-    with connect(robot.plain, source="teleop") as victim, Bus(robot.plain) as bus:
-        refused = bus.count("command_other_certificate")
-        states = attacked(robot, victim, victim._connection._sender._id)
-        assert bus.count("command_other_certificate") > refused
-        assert (
-            "this sender id is already in use on the robot's own machine" in bus.state()["refused"]
-        )
-    assert not [state for state in states if abs(state["angular"] or 0.0) > 0.05]
-    assert {state["sender"] for state in states if state["mode"] == "driving"} == {
-        victim._connection.sender
-    }
-    events = robot.daemon.events("command_refused")
-    assert any(event["by"] == f"{victim._connection.sender} [operator]" for event in events)
 
 
 def test_the_sender_of_a_client_over_tls_has_the_name_of_its_certificate(robot: Gated) -> None:

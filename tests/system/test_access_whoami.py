@@ -14,15 +14,11 @@ from tests.system.harness import (
     until,
 )
 from tests.system.identities import Gated, Identity
-from tests.system.terminals import SCREEN, at_terminal
 
 pytestmark = pytest.mark.network
 
 
 VIEWER_MAY = "this role may read data and stop the robot, but not drive it"
-
-SILENCE = "your certificate, unlisted, may be missing from every role"
-"""The last part of the message for a silence that may have any cause."""
 
 
 @pytest.fixture(scope="module")
@@ -41,34 +37,10 @@ def test_whoami_returns_the_role_and_name_of_each_certificate(robot: Gated, role
         assert (us.role, us.certificate, us.sender) == (role, role, client._connection.sender)
 
 
-def test_a_local_client_without_a_certificate_is_a_maintainer(robot: Gated) -> None:
-    with connect(robot.plain) as client:
-        us = client.whoami()
-    assert (us.role, us.certificate) == ("maintainer", "")
-
-
 def test_doctor_prints_the_role_the_certificate_and_its_permissions(robot: Gated) -> None:
     output = robot.tool("viewer", "doctor").out
     assert f"role: your certificate viewer has the role viewer: {VIEWER_MAY}" in output
     assert re.search(r"; your sender id is \S+@\S+ acsard doctor/[0-9a-f]{16}", output)
-
-
-@pytest.mark.slow
-def test_doctor_reports_an_unlisted_certificate(robot: Gated) -> None:
-    ended = robot.tool("unlisted", "doctor")
-    assert ended.code == 1
-    assert SILENCE in ended.out
-
-
-@pytest.mark.slow
-def test_the_drive_verb_refuses_an_unlisted_certificate_before_a_key_is_pressed(
-    robot: Gated,
-) -> None:
-    link = ["--connect", robot.tls, "--tls", robot.own("unlisted")]
-    where = robot.daemon.config.parent
-    with at_terminal(where, "drive", *link, term=SCREEN, piped="stderr") as (_, program):
-        assert program.ended(10.0) == 69
-    assert SILENCE in program.stderr
 
 
 @pytest.mark.parametrize(

@@ -140,28 +140,6 @@ def test_every_row_of_a_sound_board_is_measured_in_real_time(tmp_path: Path, tex
     assert sum(name.startswith("motor ") for name in verdicts) == (2 if text else 4)
 
 
-@pytest.mark.slow
-def test_ctrl_c_at_the_first_question_ends_mcu_check_with_130(tmp_path: Path) -> None:
-    with at_terminal(tmp_path, "mcu", "check", "--port", "sim") as (terminal, program):
-        until(lambda: "lifted" in terminal.screen, 10.0, "the question")
-        terminal.press("\x03")
-        assert program.ended(5.0) == 130
-        assert "Traceback" not in terminal.screen
-
-
-@pytest.mark.slow
-@pytest.mark.nightly
-def test_q_without_enter_ends_mcu_check_while_a_motor_turns(tmp_path: Path) -> None:
-    with Program(acsard("sim"), tmp_path) as sim:
-        port = sim.says("acsard run --port").split()[-1]
-        with at_terminal(tmp_path, "mcu", "check", "--port", port) as (terminal, program):
-            answer(terminal, 'then type "lifted"', "lifted", 1, 10.0)
-            until(lambda: "motor a" in terminal.screen, CHECK_S, "the first motor")
-            terminal.press("q")
-            assert program.ended(5.0) == 130
-            assert "Traceback" not in terminal.screen
-
-
 # on ptys, in real time
 
 

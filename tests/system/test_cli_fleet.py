@@ -9,7 +9,6 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import pytest
 import zenoh
@@ -101,18 +100,6 @@ def test_what_the_tools_print_about_several_robots_is_approved(
     for pattern, name in VARYING:
         text = re.sub(pattern, name, text)
     approved(WORDS, text + "\n")
-
-
-def messages(program: Program) -> list[Any]:
-    """Return the messages printed so far."""
-    return [json.loads(line) for line in program.out]
-
-
-def test_echo_of_all_robots_names_the_robot_of_each_message(robots: Robots) -> None:
-    with Program(robots.command_line("echo", "state"), robots.where) as program:
-        until(lambda: {entry["robot"] for entry in messages(program)} >= {ONE, TWO}, 10.0, "both")
-    assert all(entry["message"]["link"] for entry in messages(program))
-    assert "following robot1, robot2" in program.stderr
 
 
 HOSTILE = "[2J\x1b]0;x\x07"

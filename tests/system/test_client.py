@@ -4,11 +4,8 @@ from __future__ import annotations
 
 import asyncio
 import json
-import math
 import sys
-import time
 from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -20,20 +17,17 @@ from acsard.core.messages import schema
 from acsard.core.messages.refusals import BUSY_ENCODING
 from acsard.host.errors import (
     NoAnswerError,
-    NotDrivenError,
     ReplyError,
     UnreachableError,
     UsageError,
 )
 from tests.each import each
-from tests.system.bystander import lost
 from tests.system.harness import (
     ROOT,
     Bus,
     Daemon,
     finish,
     free_endpoint,
-    until,
 )
 
 DEFAULT = "tcp/127.0.0.1:7448"
@@ -156,43 +150,6 @@ def test_an_invalid_address_raises_a_value_error(endpoint: str, robot_id: str, w
     with pytest.raises(UsageError, match=why) as error, connect(endpoint, robot_id=robot_id):
         pass
     assert isinstance(error.value, ValueError)
-
-
-def test_a_drive_that_is_stopped_on_its_way_raises_and_does_not_go_on(
-    shared: Daemon, fresh: Bus
-) -> None:
-    with connect(shared.endpoint) as robot:
-
-        def stop() -> None:
-            until(lambda: (fresh.state()["linear"] or 0.0) > 0.1, 5.0, "driving")
-            fresh.session.put("acsard/acsar/stop", b"")
-
-        with ThreadPoolExecutor(1) as other:
-            stopping = other.submit(stop)
-            with pytest.raises(NotDrivenError, match="stopped"):
-                robot.drive(0.3, seconds=30.0)
-            stopping.result()
-        robot.call("clear")
-        with pytest.raises(ReplyError, match="linear_speed"):
-            robot.set({"limits.linear_speed": -1.0})
-
-
-@pytest.mark.slow
-def test_move_and_turn_end_within_five_millimetres_and_half_a_degree(
-    shared: Daemon, fresh: Bus
-) -> None:
-    with connect(shared.endpoint) as robot:
-        begun = time.monotonic()
-        robot.move(0.2)
-        robot.turn(-90)
-        robot.move(-0.1)
-        robot.turn(90)
-        late = lost(begun)
-        pose = robot.pose()
-    # A late message lets the robot go on, at 0.02 m/s and 3 degrees a second near the end.
-    assert pose.x == pytest.approx(0.2, abs=0.005 + 0.02 * late)
-    assert pose.y == pytest.approx(0.1, abs=0.005 + 0.02 * late)
-    assert math.degrees(pose.yaw) == pytest.approx(0.0, abs=1.0 + 3.0 * late)
 
 
 def test_the_client_repeats_a_query_to_a_busy_daemon_and_never_a_service_call() -> None:

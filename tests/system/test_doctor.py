@@ -114,20 +114,6 @@ def test_a_pty_of_a_container_that_has_the_same_name_is_another_one(
         assert [holder.pid for holder in masters_of(terminal)] == [os.getpid()]
 
 
-def test_doctor_reports_the_mode_of_a_running_daemon(tmp_path: Path) -> None:
-    with FarPeer(tmp_path) as peer, Daemon(tmp_path, peer.path) as daemon, Bus(daemon.endpoint):
-        peer.awaits(b"ap00.00")
-        listen = f'[bus]\nlisten = ["{daemon.endpoint}"]\n'
-        code, findings = examined(tmp_path, f'[mcu]\nport = "{peer.path}"\n{listen}')
-        assert findings["daemon"][0]["level"] == "ok"
-        assert f"pid {daemon.pid}" in findings["daemon"][0]["text"]
-        assert findings["mode"][0]["text"].startswith("waiting for a command")
-        assert all(finding["level"] != "failure" for finding in findings["daemon"])
-        # The far peer is the board: it holds the pty, and is not to be killed.
-        assert "kill" not in worst(findings["port"])["mend"]
-    assert code == 0, findings
-
-
 def test_doctor_uses_the_running_daemon_s_values_and_reports_where_the_file_differs(
     tmp_path: Path,
 ) -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import signal
-import socket
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -16,7 +15,6 @@ from tests.system.harness import (
     Daemon,
     Program,
     acsard,
-    finish,
     free_endpoint,
     until,
 )
@@ -103,21 +101,6 @@ def test_foxglove_shows_the_topics_of_a_recording_as_they_are_on_the_bus(
         until(lambda: found() >= 3, 5.0, f"{messages} on the bus")
 
 
-@SLOW
-def test_the_log_topic_has_an_event_of_the_daemon_once(viewer: Viewer, bus: Bus) -> None:
-    log = viewer.show("/log")
-    log.first()
-    bus.get("srv/stop")
-    bus.get("srv/clear")
-
-    def texts() -> list[str]:
-        messages = [log.read(entry.payload) for entry in list(log.came)]
-        return [f"{message.name}: {message.msg}" for message in messages]
-
-    until(lambda: any("cleared" in text for text in texts()), 5.0, "the release")
-    assert sum("stopped by unnamed" in text for text in texts()) == 1
-
-
 def test_a_key_is_subscribed_only_while_a_viewer_shows_it(viewer: Viewer, bus: Bus) -> None:
     # Zenoh tells a publisher of a key whether any subscriber listens.
     publisher: Any = bus.session.declare_publisher(f"{bus.root}/tf")
@@ -177,18 +160,3 @@ def test_a_daemon_that_is_gone_is_reported_and_waited_for(tmp_path: Path) -> Non
             count = len(looked.came)
             until(lambda: len(looked.came) > count + 10, 10.0, "odometry again")
             assert viewer.call("/acsard/stop", {})["success"]
-
-
-@SLOW
-def test_a_port_that_is_in_use_ends_with_75_and_the_remedy(shared: Daemon, tmp_path: Path) -> None:
-    with socket.socket() as listener:
-        listener.bind(("127.0.0.1", 0))
-        listener.listen()
-        address = f"127.0.0.1:{listener.getsockname()[1]}"
-        words = ("foxglove", "--config", str(shared.config), "--address", address)
-        ended = finish(acsard(*words), tmp_path)
-    assert ended.code == 75
-    assert f"cannot listen on {address}: " in ended.err
-    assert "Address already in use" in ended.err
-    assert "--address 127.0.0.1:" in ended.err
-    assert "Traceback" not in ended.err

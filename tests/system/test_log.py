@@ -1,61 +1,14 @@
-"""The log of the real process names each caller, and each change with its reason.
-
-It also reports how the process started and ended.
-"""
+"""The log of the real process says how it started, each change with its reason, and its end."""
 
 from __future__ import annotations
 
-import os
-import re
 import signal
-import subprocess
 from pathlib import Path
-from typing import Any
 
 import pytest
 
-from acsard.bus import robot_discovery
-from acsard.bus.address import Address
-from acsard.client import connect
-from acsard.client.connection import open_connection
-from acsard.host.own_identity import own_name
 from acsard.host.version import version
-from tests.system.harness import Bus, Daemon, Peer, acsard, running, until
-
-
-def by(daemon: Daemon, name: str) -> list[Any]:
-    return [line["by"] for line in daemon.events(name)]
-
-
-def test_the_log_names_the_client_of_each_call_by_its_own_name(shared: Daemon, bus: Bus) -> None:
-    with connect(shared.endpoint) as robot:
-        robot.call("set_pose", x=1.0, y=0.0, yaw=0.0)
-        robot.name = "patrol \x1b[2J(native)"
-        robot.call("stop")
-    call = acsard("call", "clear", "--connect", shared.endpoint)
-    subprocess.run(call, check=True, capture_output=True)
-    bus.ask("srv/deactivate")
-    until(lambda: shared.events("deactivate"), 5.0, "the last call is in the log")
-    (pose,), (stop,), (clear,) = (by(shared, name) for name in ("set_pose", "stop", "clear"))
-    me = f"@{os.uname().nodename.partition('.')[0]}"
-    assert me in own_name()
-    assert re.fullmatch(rf"{re.escape(own_name())}/[0-9a-f]{{16}} \(native\)", pose)
-    assert re.fullmatch(r"patrol \?\?2J\?native\?/[0-9a-f]{16} \(native\)", stop)
-    assert re.search(rf"{me} acsard call/[0-9a-f]{{16}} \(native\)$", clear)
-    assert by(shared, "deactivate") == ["unnamed (native)"]
-
-
-def test_one_program_that_puts_on_stop_and_calls_it_has_one_name(shared: Daemon, bus: Bus) -> None:
-    stops = len(shared.events("stop"))
-    with open_connection(Address(shared.endpoint, "acsar", "")) as robot:
-        robot_discovery.stop(robot.session, ["acsar"], robot.caller)
-        # Two stops that one step of a busy daemon reads are one event.
-        until(lambda: len(shared.events("stop")) == stops + 1, 5.0, "the first is in the log")
-        robot.call("stop")
-        until(lambda: len(shared.events("stop")) == stops + 2, 5.0, "both stops are in the log")
-        (name,) = {line["by"] for line in shared.events("stop")[stops:]}
-        assert bus.state()["reason"].count(f"stopped by {name}") == 1
-        robot.call("clear")
+from tests.system.harness import Peer, running, until
 
 
 @pytest.mark.slow

@@ -111,17 +111,6 @@ async def test_every_message_of_the_socket_is_described_and_every_described_one_
         ] == []
 
 
-async def test_a_stop_passes_a_flood_of_its_own_connection(page: Page, bus: Bus) -> None:
-    """The flood ends the connection, and the stop behind it counts."""
-    async with hands(page) as ours:
-        for _ in range(1000):
-            await ours.say(ping=1)
-        await ours.say(call="stop", id=1)
-        await asyncio.to_thread(
-            until, lambda: bus.state()["mode"] == "stopped", 5.0, "stopped behind the flood"
-        )
-
-
 TYPED = ("/api/state", "/api/whoami", "/api/settings", "/api/recordings", "/api/info")
 """Some paths with a type of their own, which not any JSON fits."""
 
@@ -250,15 +239,3 @@ def test_a_daemon_in_a_terminal_serves_its_page_at_a_free_port_and_restarts_it(
             (third,) = daemon.page()
             daemon.signal(signal.SIGKILL)
             until(lambda: not Path(f"/proc/{third}").exists(), START_S, "the page ends too")
-
-
-@pytest.mark.slow
-def test_a_daemon_without_a_terminal_or_with_the_page_disabled_serves_no_page(
-    tmp_path: Path,
-) -> None:
-    config = write_config(tmp_path / "a.toml", {"web": {"page": False}})
-    with Terminal(tmp_path, "--config", str(config)) as terminal, Daemon(tmp_path) as piped:
-        terminal.shows("link_up")
-        until(lambda: "link_up" in piped.stderr, START_S, "link up")
-        assert terminal.page() == []
-        assert children(piped.pid, "acsard web") == []

@@ -4,13 +4,11 @@ from __future__ import annotations
 
 import asyncio
 import math
-import os
 import socket
 import time
 import urllib.request
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
-from pathlib import Path
 from typing import Any
 
 import aiohttp
@@ -18,11 +16,9 @@ import pytest
 from yarl import URL
 
 from acsard.web.access import REQUEST_RATE
-from acsard.web.app import BODY_TIMEOUT_S
-from acsard.web.connections import IDLE_S, UNREAD_S
 from tests.system.browser import NAME, Hands, Page, hands
 from tests.system.bystander import lost
-from tests.system.harness import PATIENCE_S, Bus, resident_kb, until
+from tests.system.harness import PATIENCE_S, Bus, resident_kb
 
 pytestmark = pytest.mark.network
 
@@ -252,71 +248,3 @@ async def test_a_socket_that_floods_with_any_message_ends_and_no_other_does(
                 assert theirs.socket.closed
         await ours.say(ping=1)
         await ours.find(lambda frame: "pong" in frame)
-
-
-@pytest.mark.parametrize("before", [b"", b"GET / HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n"])
-def test_a_head_without_an_end_is_cut_off(target: Target, before: bytes) -> None:
-    """Send endless headers, in the first request of a connection or in the second.
-
-    Otherwise clients without a token could fill the memory.
-    """
-    sent = 0
-    with target.refuses("malformed"), target.opened() as greedy, suppress(ConnectionError):
-        greedy.sendall(before)
-        if before:
-            assert greedy.recv(100).startswith(b"HTTP/1.1 200")
-        greedy.sendall(b"GET / HTTP/1.1\r\nHost: 127.0.0.1\r\n")
-        for number in range(200):
-            greedy.sendall(b"X-%d: " % number + b"x" * 3000 + b"\r\n")
-            sent += 3000
-            time.sleep(0.005)
-    assert sent < 300_000
-
-
-@pytest.mark.nightly
-def test_a_slow_or_silent_client_is_disconnected(target: Target) -> None:
-    """One client sends a byte a second, one sends nothing, one announces a body and sends none."""
-    begun = time.monotonic()
-    with (
-        target.refuses("malformed"), target.opened() as drips, target.opened() as says_nothing,
-        target.opened() as keeps,
-    ):  # fmt: skip
-        keeps.sendall(f"{CLEAR} HTTP/1.1\r\nHost: 127.0.0.1\r\n".encode())
-        keeps.sendall(b"Content-Length: 100\r\n\r\n")
-        drips.settimeout(1.0)
-        with suppress(ConnectionError):
-            for byte in b"GET / HTTP/1.1\r\nHost: 127.0.0.1\r\nX-Slow: very":
-                drips.sendall(bytes([byte]))
-                with suppress(TimeoutError):
-                    assert drips.recv(4096) == b""
-                    break
-            else:
-                raise AssertionError("the server did not cut it off")
-        with suppress(ConnectionError):
-            assert says_nothing.recv(4096) == b""
-        assert keeps.recv(4096).startswith(b"HTTP/1.1 408")
-    assert time.monotonic() - begun < max(BODY_TIMEOUT_S, IDLE_S) + PATIENCE_S
-
-
-def test_a_client_that_does_not_read_its_answers_is_disconnected_soon(target: Target) -> None:
-    place = Path(f"/proc/{target.page.pid}/fd")
-    with socket.socket() as greedy:
-        greedy.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
-        greedy.connect(("127.0.0.1", target.port))
-        ours = f":{greedy.getsockname()[1]:04X} "
-
-        def held() -> bool:
-            """Return whether the server still has the connection."""
-            lines = Path("/proc/net/tcp").read_text().splitlines()
-            (inode,) = [line.split()[9] for line in lines if ours in line.split()[2] + " "] or ["0"]
-            with suppress(FileNotFoundError):  # the server closes another file meanwhile
-                return any(os.readlink(link) == f"socket:[{inode}]" for link in place.iterdir())
-            return True
-
-        greedy.setblocking(False)
-        with suppress(BlockingIOError):
-            for _ in range(100_000):
-                greedy.send(b"GET /page/main.js HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n")
-        until(held, PATIENCE_S, "it is accepted")
-        until(lambda: not held(), UNREAD_S + PATIENCE_S / 3, "it is disconnected")
-    assert "Traceback" not in target.page.stderr

@@ -6,28 +6,17 @@ its touches, keys and clicks, its cookies, and its rules for scripts.
 
 from __future__ import annotations
 
-import time
-from collections.abc import Iterator
-from pathlib import Path
-
 import pytest
 
 from acsard.cli import command_line
-from acsard.machine.authority import Authority
-from tests.system.browser import NAME, TRUSTING, Page
-from tests.system.chromium import CHROMIUM, PHONE, RED, browsing
-from tests.system.harness import running as running_daemon
+from tests.system.chromium import CHROMIUM
 from tests.system.harness import until
-from tests.system.phone_page import HELD, Phone, alone
+from tests.system.phone_page import Phone, alone
 
 pytestmark = [
     pytest.mark.slow,
     pytest.mark.skipif(CHROMIUM is None, reason="needs chromium-headless-shell"),
 ]
-
-
-def moves(page: Phone, field: str = "linear") -> bool:
-    return (page.bus.state()[field] or 0.0) > 0.15
 
 
 def test_a_finger_drives_turns_and_stops_and_releases_the_stop(phone: Phone) -> None:
@@ -53,28 +42,6 @@ def test_a_finger_drives_turns_and_stops_and_releases_the_stop(phone: Phone) -> 
     browser.key("Up", "Space", " ")
     phone.shows("mode", "STOPPED")
     assert browser.said == []
-
-
-LIMIT = "document.getElementById('limit').value"
-
-
-def test_keys_drive_while_they_are_held_also_after_the_slider_was_set(phone: Phone) -> None:
-    browser, bus, before = phone.browser, phone.bus, phone.browser.js(LIMIT)
-    browser.mouse("Pressed", browser.middle("limit"))
-    browser.mouse("Released", browser.middle("limit"))
-    until(lambda: browser.js(LIMIT) != before, 5.0, "it is set")
-    chosen = browser.js(LIMIT)
-    browser.key("Down", "ArrowUp", "ArrowUp", windowsVirtualKeyCode=38)
-    fast = float(chosen) - 0.05
-    until(lambda: (bus.state()["linear"] or 0.0) > fast, 10.0, "forwards, as fast")
-    assert browser.js(LIMIT) == chosen
-    browser.key("Down", "KeyA", "a")
-    until(lambda: moves(phone, "angular"), 10.0, "and left")
-    browser.key("Up", "ArrowUp", "ArrowUp")
-    until(lambda: not moves(phone), 10.0, "left only")
-    browser.key("Up", "KeyA", "a")
-    bus.at_rest()
-    assert browser.js(HELD) is False
 
 
 SET = """(() => {
@@ -115,38 +82,3 @@ def test_settings_reach_the_robot_and_text_of_strangers_is_only_shown(phone: Pho
     assert browser.js("document.querySelectorAll('#happened img').length") == 0
     assert browser.js("document.title") == "READY · acsar"
     assert browser.js(ADDED) is False
-
-
-@pytest.fixture
-def stranger(tmp_path: Path) -> Iterator[Phone]:
-    """A phone that the robot does not know."""
-    Authority.make(tmp_path / "tls", "test", 1, [NAME]).issue(tmp_path / "tls", "robot", [NAME], 1)
-    with (
-        running_daemon(tmp_path) as (daemon, bus), Page(daemon, tmp_path) as server,
-        browsing(options=TRUSTING) as browser,
-    ):  # fmt: skip
-        browser.size(*PHONE)
-        yield Phone(daemon, bus, server, browser)
-
-
-def test_an_invited_phone_stops_learns_that_its_token_was_revoked_and_is_invited_again(
-    stranger: Phone,
-) -> None:
-    browser, server = stranger.browser, stranger.server
-    browser.open(f"{server.away}/#token={server.invite('viewer', 'tv')}")
-    stranger.shows("role", "viewer")
-    stranger.shows("mode", "READY")
-    assert browser.js("location.hash") == ""
-    browser.tap("stop")
-    stranger.shows("reason", "an operator releases it")
-    assert stranger.bus.state()["mode"] == "stopped"
-    server.vault.revoke("tv")
-    stranger.shows("reason", "this token is not valid")
-    assert browser.js(RED) is False
-    assert browser.too_small() == []
-    refused = sum(server.refused().values())
-    time.sleep(1.5)  # the page would have tried again twice
-    assert sum(server.refused().values()) == refused
-    browser.js(f"location.hash = 'token={server.invite('operator', 'phone')}'")
-    stranger.shows("role", "operator")
-    assert browser.js(RED) is True

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import asyncio
 import re
 import time
 from collections.abc import Iterator
-from contextlib import AsyncExitStack, closing
+from contextlib import closing
 
 import pytest
 
@@ -17,7 +16,7 @@ from tests.system.browser import NAME, Page
 from tests.system.bystander import lost
 from tests.system.camera_stream import Stream
 from tests.system.chromium import CHROMIUM, PHONE, browsing
-from tests.system.harness import resident_kb, running, until
+from tests.system.harness import running, until
 
 pytestmark = pytest.mark.slow
 
@@ -78,32 +77,6 @@ def test_the_page_shows_the_camera_with_its_age_and_marks_a_frozen_picture_withi
         time.sleep(4.0)  # two pictures have come since
         assert browser.js(FROZEN)
     until(lambda: stream.clients == 0, 15.0, "no client reads the stream any more")
-
-
-async def test_pictures_that_no_client_reads_cost_little_memory(
-    stream: Stream, server: Page
-) -> None:
-    """A TLS connection has buffers of 0.6 MB. A picture for each would be 43 MB more."""
-    stream.more = 900_000
-    url, clients = f"{server.away}/api/camera", []
-    tokens = [server.invite("viewer", f"tv{n}") for n in range(12)]
-    async with AsyncExitStack() as stack:
-        for token in tokens * 4:
-            clients.append(await stack.enter_async_context(server.client(token)))
-        async with clients[0].get(url) as answer:
-            assert answer.status == 200
-            await answer.read()
-        before = resident_kb(server.pid)
-        # The streams of these answers are opened and not read.
-        asking = [asyncio.create_task(client.get(url)) for client in clients]
-        most, end = 0, time.monotonic() + 3.0
-        while time.monotonic() < end:
-            most = max(most, resident_kb(server.pid) - before)
-            await asyncio.sleep(0.05)
-        for task in asking:
-            task.cancel()
-        print(f"\n48 clients that read no pictures: {most / 1000:+.1f} MB")
-        assert most < 50_000
 
 
 def test_three_pages_with_one_token_may_ask_for_pictures_and_drive() -> None:

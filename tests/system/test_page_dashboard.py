@@ -73,36 +73,6 @@ def bus(robot: Daemon) -> Iterator[Bus]:
         yield bus
 
 
-async def test_a_page_of_another_origin_sends_its_token_and_no_cookie(
-    server: Page, origin: str
-) -> None:
-    token, site_headers = server.invite("operator", "panel"), {"Origin": origin}
-    async with server.client() as browser:
-        url = f"{server.away}/token"
-        async with browser.post(url, json={"token": token}, allow_redirects=False) as answer:
-            assert answer.status == 303
-        for headers, status in [({}, 200), (site_headers, 401)]:
-            async with browser.get(f"{server.away}/api/state", headers=headers) as answer:
-                assert answer.status == status
-        with pytest.raises(aiohttp.WSServerHandshakeError) as caught:
-            await browser.ws_connect(f"{server.away}/ws", headers=site_headers)
-        assert caught.value.status == 401
-        token_headers = {**site_headers, "Authorization": f"Bearer {token}"}
-        async with browser.get(f"{server.away}/api/state", headers=token_headers) as answer:
-            assert answer.status == 200
-        mine = f"acsard.token.{token}"
-        opening = browser.ws_connect(
-            f"{server.away}/ws", headers=site_headers, protocols=("acsard", mine)
-        )
-        async with opening as opened:
-            assert opened.protocol == "acsard"
-            assert json.loads((await opened.receive()).data)["hello"]["role"] == "operator"
-        for names in [["acsard", "acsard.token.wrong"], [mine]]:
-            with pytest.raises(aiohttp.WSServerHandshakeError):
-                await browser.ws_connect(f"{server.away}/ws", headers=site_headers, protocols=names)
-    assert token not in server.stdout + server.stderr
-
-
 @pytest.mark.skipif(NODE is None, reason="needs node")
 async def test_the_proxy_of_the_manual_makes_requests_look_like_the_page_s_own(
     server: Page,

@@ -17,8 +17,8 @@ import pytest
 
 from tests.system.browser import Page
 from tests.system.chromium import CHROMIUM, DESKTOP, PHONE, SIDEWAYS, Browser
-from tests.system.harness import TWO_WHEELS, Bus, Daemon, Peer, until
-from tests.system.phone_page import Phone, alone
+from tests.system.harness import Bus, Daemon, Peer, until
+from tests.system.phone_page import Phone
 from tests.tools import pictures
 from tests.tools.pictures import VIEWS
 
@@ -230,46 +230,3 @@ def test_the_map_shows_the_robot_its_direction_a_scale_and_a_lost_place(
     mapped.shows("mode", "READY")
     until(lambda: browser.js(slope) == "normal", 5.0, "the place is known")
     assert drawn("--accent") == begun
-
-
-SEEN = """(() => {
-    const canvas = document.getElementById('plot-wheels'), paper = canvas.getContext('2d');
-    const {width, height} = canvas, style = getComputedStyle(document.documentElement);
-    const {data} = paper.getImageData(0, 0, width, height), found = new Set();
-    for (let n = 0; n < data.length; n += 4)
-        if (data[n + 3] === 255) found.add([data[n], data[n + 1], data[n + 2]].join());
-    const wanted = [0, 1, 2, 3].map(n => {
-        paper.fillStyle = style.getPropertyValue(`--w${n}`).trim();
-        const [, r, g, b] = /#(..)(..)(..)/.exec(paper.fillStyle);
-        return [r, g, b].map(one => parseInt(one, 16)).join();
-    });
-    return new Set(wanted.filter(one => found.has(one))).size;
-})()"""
-
-
-@pytest.mark.nightly
-@pytest.mark.parametrize(
-    ("own_robot", "names"),
-    [
-        (None, ["front right", "front left", "rear left", "rear right"]),
-        (TWO_WHEELS, ["right", "left"]),
-    ],
-    indirect=["own_robot"],
-)
-@alone
-def test_curves_that_overlap_are_distinguishable_and_show_their_values(
-    phone: Phone, names: list[str]
-) -> None:
-    browser = phone.browser
-    browser.size(*DESKTOP, touch=False)
-    browser.tap("tab-status")
-    rows = "[...document.querySelectorAll('#plot-wheels + .legend > span')]"
-    legend = f"{rows}.map(one => one.textContent)"
-
-    def named() -> list[str]:
-        values = [re.fullmatch(r"(.+) .?\d+\.\d\d", label) for label in browser.js(legend)]
-        return [value[1] for value in values if value]
-
-    until(lambda: named() == names, 10.0, "values")
-    # At rest all are zero: each has its colour somewhere on the line.
-    until(lambda: browser.js(SEEN) == len(names), 20.0, "a colour for each wheel")

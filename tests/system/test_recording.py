@@ -16,7 +16,7 @@ from typing import Any
 import pytest
 
 from tests.system import bystander
-from tests.system.harness import ROOT, Bus, Daemon, acsard, environment, finish, until
+from tests.system.harness import Bus, Daemon, acsard, finish, until
 
 LOST_S = 1.5
 """The recording that a kill or a power cut may cost at most."""
@@ -93,25 +93,6 @@ Robot.hear = hear
 
 
 @pytest.mark.slow
-def test_a_fault_of_the_daemon_is_reported_and_the_input_of_that_step_is_recorded(
-    tmp_path: Path,
-) -> None:
-    (bug := tmp_path / "bug").mkdir()
-    (bug / "sitecustomize.py").write_text(BUG)
-    env = environment(PYTHONPATH=f"{bug}:{ROOT}")
-    with recording(tmp_path, env=env) as (daemon, bus), bus.commanding(0.3):
-        until(lambda: bus.state()["mode"] == "driving", 5.0, "drives")
-        bus.put("stop", "")
-        assert daemon.ended(5.0) != 0
-    (path,) = files(tmp_path)
-    shown = finish(acsard("recording", "show", "--directory", str(path.parent)), tmp_path).out
-    assert "ZeroDivisionError: a fault of our own" in shown
-    assert replayed(tmp_path, path) > 3
-    again = finish(acsard("recording", "replay", str(path)), tmp_path)
-    assert "does not fail in this version" in again.out
-
-
-@pytest.mark.slow
 def test_a_recording_is_complete_after_an_orderly_end_and_readable_only_by_its_group(
     tmp_path: Path,
 ) -> None:
@@ -124,15 +105,3 @@ def test_a_recording_is_complete_after_an_orderly_end_and_readable_only_by_its_g
     assert path.stat().st_mode & 0o777 == 0o640
     assert path.parent.stat().st_mode & 0o777 == 0o750
     assert replayed(tmp_path, path) > 3
-
-
-@pytest.mark.slow
-def test_a_directory_that_cannot_be_made_is_reported_and_the_robot_runs(tmp_path: Path) -> None:
-    with (
-        Daemon(tmp_path, words=["--record", "/proc/nowhere"]) as daemon,
-        Bus(daemon.endpoint) as bus,
-    ):
-        until(lambda: "/proc/nowhere" in bus.state()["recording_error"], 10.0, "it is said")
-        bus.linked()
-        with bus.commanding(0.3):
-            until(lambda: bus.state()["mode"] == "driving", 5.0, "drives")

@@ -19,7 +19,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pytest
 
-from tests.promised import TRIGGERS
 from tests.system.builds import BUILD_S
 from tests.system.bystander import lost
 from tests.system.fast_dds import FastDdsNode
@@ -34,7 +33,6 @@ from tests.system.ros_clients import (
     QUICK,
     REQUESTS,
     STAMPED,
-    TRIGGER,
     TWIST,
     WHEELS,
     BridgeHalf,
@@ -204,20 +202,6 @@ def test_any_message_on_stop_request_stops(
 
 # services
 
-EMPTY_FORMS = (b"\0\1\0\0", EMPTY_REQUEST, b"\0\1\0\0\0\0\0\0")
-"""The forms of an empty request. Cyclone DDS for Python knows only the second one."""
-
-
-@pytest.mark.parametrize("verb", sorted({*TRIGGERS} - {"clear"}))  # the contract has that
-def test_a_trigger_is_answered_once_for_every_form_of_an_empty_request(
-    bus: Bus, caller: Client, verb: str
-) -> None:
-    for request in EMPTY_FORMS if isinstance(caller, ZenohClient) else (EMPTY_REQUEST,):
-        called = caller.call(f"acsard/{verb}", TRIGGER, request)
-        success, message = called.trigger()
-        assert success, message
-        assert called.seconds < 1.0
-
 
 def call_parameters(caller: Client, service: str, **request: Any) -> Any:
     """Call one of the parameter services of ROS and return its only reply."""
@@ -254,19 +238,3 @@ def _limit(value: float) -> Any:
     none |= {f"{kind}_value": np.array([]) for kind in lists}
     double = make("rcl_interfaces/msg/ParameterValue", type=3, double_value=value, **none)
     return make("rcl_interfaces/msg/Parameter", name="limits.linear_speed", value=double)
-
-
-QUERIES = {
-    RmwClient: ("0/**", "0/acsard/*/std_srvs::srv::dds_::Trigger_/*", "**"),
-    BridgeHalf: ("acsard/*", "**", "acsard/stop/**", "*/stop"),
-}
-
-
-def test_a_query_on_all_keys_stops_nothing(bus: Bus, zenoh_ros: ZenohClient) -> None:
-    before = bus.state()
-    for key in QUERIES[type(zenoh_ros)]:
-        for _ in bus.session.get(key, payload=EMPTY_REQUEST, attachment=zenoh_ros.attachment()):
-            pass
-    after = bus.state()
-    assert after["mode"] != "stopped"
-    assert changes(before, after) == {}

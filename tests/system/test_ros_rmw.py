@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import queue
 import struct
 import time
 from collections.abc import Iterator
@@ -16,7 +15,6 @@ import zenoh
 
 from tests.system.harness import Bus, Daemon, client_config, free_endpoint, until
 from tests.system.ros_clients import (
-    GET,
     JOINTS,
     ODOMETRY,
     PUBLISHED,
@@ -35,9 +33,7 @@ from tests.system.ros_clients import (
     Samples,
     Sdk,
     ZenohClient,
-    encode,
     gid_of,
-    make,
     over_router,
     rmw_key,
     two_robots,
@@ -144,32 +140,6 @@ def ros(bus: Bus) -> RmwClient:
     return RmwClient(bus.session)
 
 
-def test_every_liveliness_token_has_the_form_of_rmw_zenoh(bus: Bus, ros: RmwClient) -> None:
-    (zid,) = map(str, bus.session.info.peers_zid())
-    rows = [("MP", name, *row) for name, row in PUBLISHED.items()]
-    rows += [("SS", name, kind, 10, False) for name, kind in SERVICES.items()]
-    rows += [("MS", name, kind, 10, False) for name in TWISTS for kind in (TWIST, STAMPED)]
-    rows += [("MS", name, kind, 10, False) for name, kind in SUBSCRIBED.items()]
-    head, node = f"@ros2_lv/0/{zid}/0", "%/%/acsard"
-    expected = {f"{head}/NUMBER/NN/{node}"}
-    for role, name, kind, depth, transient in rows:
-        _, *_, dds_type, type_hash = rmw_key(name, kind).split("/")
-        mangled = "%" + name.replace("/", "%")
-        # Reliable, and keep the last `depth` samples. Fields that equal rmw_zenoh's default are
-        # blank.
-        qos = f":{'1' if transient else ''}:,{depth}:,:,:,,"
-        token = f"{head}/NUMBER/{role}/{node}/{mangled}/{dds_type}/{type_hash}/{qos}"
-        assert token.count("/") == 12
-        expected.add(token)
-    with ros.tokens() as tokens:
-        until(lambda: len(tokens) >= len(expected), 5.0, "all tokens")
-        parts = [token.split("/") for token in tokens]
-    assert {"/".join([*token[:4], "NUMBER", *token[5:]]) for token in parts} == expected
-    # The node takes the first number of the session, each endpoint another one.
-    assert sorted(int(token[4]) for token in parts) == list(range(len(expected)))
-    assert [token[4] for token in parts if token[5] == "NN"] == ["0"]
-
-
 def test_samples_carry_the_gid_of_their_publisher_s_token_and_count_without_gaps(
     tmp_path: Path,
 ) -> None:
@@ -232,37 +202,6 @@ def test_the_static_transforms_have_the_heartbeat_for_late_subscribers(
     assert not beat.attachment
 
 
-def test_a_reply_names_its_request(bus: Bus, ros: RmwClient) -> None:
-    for sequence in (1, 2, 2**40):
-        asked = Attached(sequence, time.time_ns(), ros.gid)
-        called = ros.call("acsard/reset_odometry", attachment=asked.pack())
-        success, message = called.trigger()
-        assert success, message
-        (reply,) = called.replies
-        answered = Attached.read(reply.attachment)
-        assert (answered.sequence, answered.gid) == (asked.sequence, asked.gid)
-        assert asked.stamp_ns <= answered.stamp_ns <= time.time_ns()
-        assert reply.key == rmw_key("acsard/reset_odometry", TRIGGER)
-        assert called.seconds < 1.0
-
-
-def test_each_of_many_simultaneous_calls_is_answered(ros: RmwClient) -> None:
-    request = encode(make("rcl_interfaces/msg/GetRequest", names=["robot.id"]))
-    answers: queue.SimpleQueue[int] = queue.SimpleQueue()
-    asked = [ros.attachment() for _ in range(300)]
-    for attachment in asked:
-        ros.session.get(
-            ros.key("acsard/get_parameters", GET),
-            lambda reply: answers.put(reply.ok is not None),
-            payload=request,
-            attachment=attachment,
-            target=zenoh.QueryTarget.ALL_COMPLETE,
-            consolidation=zenoh.ConsolidationMode.NONE,
-            timeout=20.0,
-        )
-    assert [answers.get(timeout=20.0) for _ in asked] == [True] * 300
-
-
 # two robots
 
 TREES: dict[str, type[ZenohClient]] = {"bridge": BridgeHalf, "rmw": RmwClient}
@@ -281,33 +220,3 @@ def test_a_command_and_a_stop_of_one_robot_do_not_reach_the_other(fleet: Fleet, 
     assert fleet.one.state()["mode"] == "stopped"
     assert fleet.two.state()["mode"] != "stopped"
     assert fleet.one.get("srv/clear")["success"]
-
-
-def test_no_key_is_published_by_two_robots(fleet: Fleet) -> None:
-    samples, senders = Samples(), dict[str, set[str]]()
-    session = fleet.one.session
-    keys = {
-        key
-        for name in ("one", "two")
-        for client in (RmwClient(session, name), BridgeHalf(session, name))
-        for key in [client.key(topic, kind) for topic, (kind, _, _) in PUBLISHED.items()]
-        + [f"acsard/{name}/{topic}" for topic in ("odom", "tf", "state", "cmd_vel_out")]
-    }
-    subscribers = [session.declare_subscriber(key, samples.add) for key in keys]
-
-    def all_topics() -> bool:
-        senders.clear()
-        for sample in samples.seen:
-            senders.setdefault(sample.key, set()).add(sample.origin)
-        # The static transforms come only now and then.
-        return len(senders) >= len(keys) - 4
-
-    until(all_topics, 5.0, "all topics of both")
-    for subscriber in subscribers:
-        subscriber.undeclare()
-    assert {len(origins) for origins in senders.values()} == {1}
-    by_robot = dict[str, set[str]]()
-    for key, origins in senders.items():
-        by_robot.setdefault("one" if "one" in key.split("/") else "two", set()).update(origins)
-    assert {len(origins) for origins in by_robot.values()} == {1}
-    assert by_robot["one"] != by_robot["two"]

@@ -123,6 +123,7 @@ FOUR = ("fl", "fr", "rl", "rr")
 SLOW = motion([(2, 0, 0), *[(6, v, w) for v, w in ((0.1, 0), (0, 0.4), (-0.1, 0), (0, -0.4))] * 3])
 
 
+@pytest.mark.variations(3)
 @pytest.mark.parametrize("wheels", [("left", "right"), FOUR])
 @pytest.mark.parametrize(
     "counts", [16, 360, *[pytest.param(n, marks=pytest.mark.slow) for n in (32, 96, 3200)]]

@@ -250,14 +250,6 @@ def test_the_keys_of_the_bridge_are_the_bare_names_and_rmw_has_the_same_names() 
     assert {e.native for e in all_endpoints() if e.latched} == {"tf_static"}
 
 
-def test_every_key_has_the_namespace_and_every_service_the_node_name() -> None:
-    ros = RosConfig(namespace="lab/robot1")
-    bridge = keys("bridge", ros)
-    assert all(key.startswith("lab/robot1/") for key in bridge.values())
-    assert (bridge["tf"], bridge["srv/stop"]) == ("lab/robot1/tf", "lab/robot1/acsard/stop")
-    assert keys("rmw", ros)["tf"].startswith("0/lab/robot1/tf/tf2_msgs::msg::dds_::TFMessage_/")
-
-
 def test_over_rmw_a_topic_with_two_types_has_a_key_for_each_type() -> None:
     twists = [e.key.split("/")[2] for e in all_endpoints(None, "rmw") if e.native == "cmd/nav"]
     assert twists == ["geometry_msgs::msg::dds_::Twist_", "geometry_msgs::msg::dds_::TwistStamped_"]

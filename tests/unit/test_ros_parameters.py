@@ -83,18 +83,6 @@ def test_prefixes_and_depth_select_the_listed_parameters(
     assert names(prefixes, depth) == expected
 
 
-def test_each_value_has_its_ros_type() -> None:
-    assert value("robot.id") == rcl.ParameterValue(rcl.STRING, string_value="acsar")
-    assert value("mcu.baud_rate") == rcl.ParameterValue(rcl.INTEGER, integer_value=115200)
-    assert value("mcu.trailing_comma") == rcl.ParameterValue(rcl.BOOL)
-    assert value("drive.wheel_radius") == rcl.ParameterValue(rcl.DOUBLE, double_value=0.05)
-    assert value("bus.listen") == rcl.ParameterValue(
-        rcl.STRING_ARRAY, string_array_value=["tcp/127.0.0.1:7448"]
-    )
-    assert value("bus.connect") == rcl.ParameterValue(rcl.STRING_ARRAY)
-    assert value("commands.sources.app.priority").integer_value == 50
-
-
 def test_an_unknown_parameter_has_no_value_and_no_type() -> None:
     assert value("robot.weight") == rcl.ParameterValue()
     asked = rcl.Names(["robot.weight", "robot.id"])
@@ -106,23 +94,6 @@ def test_the_description_of_a_parameter_is_that_of_its_key() -> None:
     found = call("describe_parameters", asked, rcl.Descriptors).descriptors
     unknown = ParameterDescriptor("no.such", rcl.NOT_SET)
     assert found == [described("drive.wheel_radius", rcl.DOUBLE), unknown]
-
-
-WISHES: list[tuple[rcl.ParameterValue, object]] = [
-    (rcl.ParameterValue(rcl.BOOL, bool_value=True), True),
-    (rcl.ParameterValue(rcl.INTEGER, integer_value=5), 5),
-    (rcl.ParameterValue(rcl.DOUBLE, double_value=0.8), 0.8),
-    (rcl.ParameterValue(rcl.STRING, string_value="debug"), "debug"),
-    (rcl.ParameterValue(rcl.STRING_ARRAY, string_array_value=["a"]), ["a"]),
-]
-
-
-@each(("value", "expected"), WISHES)
-def test_a_set_request_gives_plain_values(value: rcl.ParameterValue, expected: object) -> None:
-    asked = rcl.SetRequest([rcl.Parameter("limits.linear_speed", value)])
-    assert rcl.requested_values(Cdr(rcl.SetRequest).encode(asked)) == {
-        "limits.linear_speed": expected
-    }
 
 
 @each("kind", [rcl.NOT_SET, 5, 6, 7, 8, 10])

@@ -5,11 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import pytest
-from msgspec.structs import replace
 
-from acsard.core.config.settings import (
-    LimitsConfig,
-)
 from acsard.core.incoming.queries import (
     Query,
     Reply,
@@ -26,14 +22,11 @@ from acsard.core.ros.shapes import Trigger
 from acsard.core.ros.transports import PARAMETER_SERVICES
 from acsard.core.values import Answer, Request
 from tests.each import each
-from tests.unit.examples import OUTPUTS
 from tests.unit.test_bus_queries import (
-    CONFIG,
     DONE,
     EMPTY,
     WALL_NS,
     answer,
-    answers,
     queries,
     query,
     served,
@@ -88,17 +81,6 @@ def test_over_rmw_a_request_needs_a_valid_attachment(topic: str, attachment: byt
     assert caught.value.reason == ("bad_attachment" if attachment else "no_attachment")
     assert made.answered(DONE, WALL_NS) is None
     assert refused(ros_query("srv/clear", attachment=b""), BUSY, WALL_NS) is None
-
-
-@each("via", VIAS)
-def test_the_parameter_services_return_the_configuration_in_force(via: str) -> None:
-    made = queries()
-    made.config = replace(CONFIG, limits=LimitsConfig(linear_speed=0.7))
-    payload = Cdr(rcl.Names).encode(rcl.Names(["robot.id", "limits.linear_speed"]))
-    (reply,) = answers(ros_query("parameters/get_parameters", via, payload), made)
-    name, speed = Cdr(rcl.Values).decode(reply.payload).values
-    assert (name.string_value, speed.double_value) == ("r7", 0.7)
-    assert attached(reply) == echo(via, OUTPUTS.now.wall_ns)
 
 
 def set_request(*wishes: float) -> bytes:

@@ -18,6 +18,7 @@ from tests.unit.rolling import (
     Bench,
     Kind,
     Robot,
+    brisk,
     faulty,
     overdue,
     restless,
@@ -99,10 +100,11 @@ def test_motors_that_keep_their_speed_under_a_moving_stick_are_found_within_two_
 
 
 def bench(counts: int, speed: float, dice: random.Random) -> Bench:
-    """Return a robot of the default size that drives straight on at this speed on even ground."""
+    """Return a robot that drives straight on at this speed on even ground, after 1 m/s2."""
     response_time = FeedbackConfig().response_time
     made = Robot(0.05, 0.30, counts, True, 0.05, response_time, 100.0, 0.05 * speed)
     driven = Bench(made, dice, rough=False)
+    driven.limits = brisk(driven.limits, 1.0)
     driven.hold(Twist(made.speed), abs(made.speed) + 2.0 + dice.random())
     return driven
 
