@@ -1,7 +1,7 @@
 """NEES of the pose of robots with drawn errors, one row for each thing that may go wrong.
 
-`python -m tests.scenarios.pose_nees [SEEDS]` prints all rows, with four wheels and with two. NEES
-is that of `tests/unit/nees.py`, and 3 if errors and covariance agree.
+`python -m tests.scenarios.pose_nees [SEEDS [NAME]]` prints the rows of this name, or all, with four
+wheels and with two. NEES is that of `tests/unit/nees.py`, and 3 if errors and covariance agree.
 """
 
 from __future__ import annotations
@@ -11,6 +11,8 @@ import random
 import sys
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
+from itertools import product
+from multiprocessing import Pool
 
 import numpy as np
 from msgspec import Struct
@@ -209,10 +211,15 @@ ROWS = {
 }
 
 
-def main(seeds: int) -> None:
-    for name, row in ROWS.items():
-        for wheels in MAPS:
-            results = [run(row, 7000 + seed, wheels) for seed in range(seeds)]
+def run_of(case: tuple[str, int, WheelMap]) -> Result:
+    name, seed, wheels = case
+    return run(ROWS[name], seed, wheels)
+
+
+def main(seeds: int = 20, chosen: str = "") -> None:
+    with Pool(2) as pool:
+        for name, wheels in product([name for name in ROWS if chosen in name], MAPS):
+            results = pool.map(run_of, [(name, 7000 + seed, wheels) for seed in range(seeds)])
             values = [result.nees for result in results]
             quiet = [result.nees for result in results if not result.doubts]
             print(
@@ -226,4 +233,4 @@ def main(seeds: int) -> None:
 
 
 if __name__ == "__main__":
-    main(int(sys.argv[1]) if len(sys.argv) > 1 else 20)
+    main(int((sys.argv + ["20"])[1]), (sys.argv + ["", ""])[2])
