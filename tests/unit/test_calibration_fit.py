@@ -5,6 +5,7 @@ The heading must improve on other drives, and the standard deviations must cover
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -366,6 +367,9 @@ def test_new_values_are_written_if_they_are_surely_better(
         readings=Errors(1.0, 1.0) if tape else None,
     )  # fmt: skip
     assert found.better is better
+    # Of independent parameters: track / mean radius, right / left, and mean radius.
+    shares = structs.replace(found, gyro_std=0.0).shares
+    assert shares == pytest.approx([0.01 * math.sqrt(v) for v in (1.5, 2.0, 0.5)])
 
 
 def test_runs_that_hardly_move_are_no_pieces() -> None:

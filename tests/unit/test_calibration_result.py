@@ -48,6 +48,8 @@ def test_a_gyro_gives_track_and_ratio_but_not_the_size(by_gyro: Result) -> None:
     stds = by_gyro.deviations
     assert stds["wheel_separation_multiplier"] == pytest.approx(0.03 * TRACK, rel=0.1)
     assert stds["left_wheel_radius_multiplier"] == pytest.approx(0.014, abs=0.002)
+    track_std = by_gyro.settings["odometry.wheel_separation_multiplier_std"]
+    assert track_std == pytest.approx(stds["wheel_separation_multiplier"], rel=0.01)
     assert by_gyro.settings["odometry.distance_scale_std"] == pytest.approx(0.014, abs=0.002)
     assert "drive.wheel_radius: measure a straight run with a tape" in by_gyro.decisions[1]
     assert "odometry.distance_variance_per_metre" not in by_gyro.settings
