@@ -291,9 +291,9 @@ def codes() -> str:
         "and `acsard mcu check --json` says in\none word why the robot does not move, and what "
         "went wrong. Words in capitals stand for values. Names such as mcu.port are\n[settings]"
         "(settings.md): the key `port` below `[mcu]` in `acsard.toml`, which for the service is "
-        "`/etc/acsard/acsard.toml`.\n`acsard doctor` and\n`acsard echo state "
-        "-n 1 --short` print the text of your robot. `wheel_fault` in `state` is a text, and stops "
-        "nothing:\n[when a wheel fails](../explanation/wheels.md).",
+        "`/etc/acsard/acsard.toml`.\n`acsard doctor` and `acsard echo state -n 1 --short` print "
+        "the text of your robot. `wheel_fault` in `state` is a text, and\nstops nothing: [when a "
+        "wheel fails](../explanation/wheels.md).",
         *texts,
     )
 
