@@ -216,7 +216,7 @@ def run_of(case: tuple[str, int, WheelMap]) -> Result:
     return run(ROWS[name], seed, wheels)
 
 
-def main(seeds: int = 20, chosen: str = "") -> None:
+def main(seeds: int, chosen: str) -> None:
     with Pool(2) as pool:
         for name, wheels in product([name for name in ROWS if chosen in name], MAPS):
             results = pool.map(run_of, [(name, 7000 + seed, wheels) for seed in range(seeds)])
@@ -233,4 +233,5 @@ def main(seeds: int = 20, chosen: str = "") -> None:
 
 
 if __name__ == "__main__":
-    main(int((sys.argv + ["20"])[1]), (sys.argv + ["", ""])[2])
+    words = sys.argv[1:]
+    main(int(words[0]) if words else 20, words[1] if len(words) > 1 else "")
