@@ -242,13 +242,14 @@ class Problem:
                 break
         found = Solution(p, sizes, self.free, scale, prior, curvature, score)
         found.left_out = np.array([found.without(n) for n in np.eye(len(self.pieces), dtype=bool)])
-        found.covariance = self._covariance(found)
+        found.covariance, found.halves = self._covariance(found)
         return found
 
-    def _covariance(self, found: Solution) -> Floats:
-        # The sum of two, each of which misses what the other one sees: the jackknife misses what a
-        # single piece shows, and the inverse information that a robot skids for a whole piece. The
-        # prior is in the second one.
+    def _covariance(self, found: Solution) -> tuple[Floats, float]:
+        # Returns it, and by how much the halves of the log contradict each other. It is the sum of
+        # two, each of which misses what the other one sees: the jackknife misses what a single
+        # piece shows, and the inverse information that a robot skids for a whole piece. The prior
+        # is in the second one.
         scale = np.diag(found.scale)
         # A reading by tape has its deviation, and may be the only one of its kind. Parts of one run
         # share what it errs by, so runs are left out whole, if there are some.
@@ -260,6 +261,7 @@ class Problem:
         apart, n = left_out - left_out.sum(axis=0) / max(1, len(groups)), max(1, len(groups))
         jackknife = apart.T @ apart * (n - 1) / n
         made = (jackknife + scale @ np.linalg.inv(found.whole) @ scale)[GEOMETRY, GEOMETRY]
+        halves = 0.0
         # Two robots, loads or floors in one log are no scatter of one, so they widen it as a whole.
         ends = np.cumsum([piece.run.seconds for piece in self.pieces])
         if "tape" not in self.sensors and len(ends) >= MIN_PIECES:
@@ -267,9 +269,9 @@ class Problem:
             moved = (found.without(first) - found.without(~first))[GEOMETRY]
             off = np.abs(SHARES @ moved)
             if np.any(off > np.maximum(HALVES, SURELY * deviations(made))):
-                found.halves = min(float(off.max()), MOST)
-                made += np.outer(moved, moved) * (found.halves / off.max() / 2) ** 2
-        return np.asarray(made)
+                halves = min(float(off.max()), MOST)
+                made += np.outer(moved, moved) * (halves / off.max() / 2) ** 2
+        return np.asarray(made), halves
 
 
 class Solution(Struct):

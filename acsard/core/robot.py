@@ -291,7 +291,7 @@ class Robot:
             silent=session.silent(draft.made_ns),
             trip=bool(trip),
         )
-        state.checks.wheels.tell(commanded, state.out.pause_ns / NS_PER_S)
+        state.checks.wheels.add_command(commanded, state.out.pause_ns / NS_PER_S)
         if line == QUESTION_LINE:
             session.asks(at_ns)
 

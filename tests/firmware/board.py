@@ -200,6 +200,8 @@ class Status(NamedTuple):
     """
 
     virtual_ns: int
+    base_ns: int
+    """Add this to a virtual time to get the monotonic clock's."""
     skipped_ns: int
     """Virtual time for which this machine was too slow."""
     fetched: int
@@ -288,6 +290,11 @@ class Board:
         answer = self._answer()
         assert answer.get("ok", True), f"the runner does not know {words!r}"
         return answer
+
+    def plug(self) -> str:
+        """Plug the board in again, with a new serial port. Return the path of the port."""
+        self.path = self.command("plug")["pty"]
+        return self.path
 
     def pause(self) -> None:
         """Let the time pass only in `passes` and `waits` from now on."""

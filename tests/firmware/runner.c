@@ -16,10 +16,12 @@
  *   status                       the true state of everything
  *   reset                        the reset pin
  *   pause, resume                virtual time stands still
+ *   mute, unmute                 what the board says is lost
  *   drop to|from N               every Nth byte to or from the board is lost; 0 = none
  *   noise to|from N              one bit of every Nth byte is wrong; 0 = none
  *   lose to|from PERCENT         so many lines are lost whole, by chance; 0 = none
  *   type WORD                    a line to the board that the host has not sent
+ *   unplug, plug                 the port vanishes; a new one appears
  *   encoder MOTOR ok|dead|swapped
  *   load MOTOR SHARE             the motor turns slower by this share; 1 = it is jammed
  *   contact PIN open|closed      what is between digital pin 30 to 37 and ground; open at first
@@ -151,7 +153,7 @@ static avr_int_vector_t pin_change;
 static const double lag = 0.05;
 static double counts_per_turn = 3200;
 static double byte_cycles = F_CPU * 10.0 / 115200;
-static bool paused, quitting, was_reset, stop_bytes;
+static bool muted, paused, quitting, was_reset, stop_bytes;
 static unsigned resets;
 static avr_cycle_count_t slept;
 static int64_t base_ns, skipped_ns;
@@ -558,7 +560,7 @@ static void on_byte_from_board(avr_irq_t *irq, uint32_t value, void *unused)
         reported_pressed = !reported_pressed;
         reported_ns = virtual_ns();
     }
-    if (!opened || outgoing_length == QUEUE)
+    if (muted || !opened || outgoing_length == QUEUE)
         from_board.lost++;
     else
         outgoing[outgoing_length++] = (uint8_t)byte;
@@ -733,13 +735,13 @@ static void print_status(void)
 
     for (i = 0; i < MOTORS; i++)
         advance(&motors[i], avr->cycle);
-    printf("{\"virtual_ns\":%" PRId64
+    printf("{\"virtual_ns\":%" PRId64 ",\"base_ns\":%" PRId64
            ",\"skipped_ns\":%" PRId64 ",\"fetched\":%" PRIu64 ",\"load\":%.4f,\"resets\":%u,\"running\":%s,\"on_ns\":%" PRId64
            ",\"off_ns\":%" PRId64 ",\"heard_ns\":%" PRId64
            ",\"answer_ns\":%" PRId64 ",\"wanted_ns\":%" PRId64 ",\"set_points\":%u,\"wrong\":%u"
            ",\"contact_ns\":%" PRId64
            ",\"reported_ns\":%" PRId64 ",\"motors\":[",
-           virtual_ns(), skipped_ns, fetched, 1.0 - (double)slept / (double)avr->cycle,
+           virtual_ns(), base_ns, skipped_ns, fetched, 1.0 - (double)slept / (double)avr->cycle,
            resets, motors_run ? "true" : "false", on_ns, off_ns, heard_ns, answer_ns, wanted_ns,
            set_points, wrong, contact_ns, reported_ns);
     for (i = 0; i < MOTORS; i++)
@@ -804,13 +806,17 @@ static bool obeyed(const char *verb, const char *one, const char *two)
         reset();
     else if (!strcmp(verb, "pause") || !strcmp(verb, "resume"))
         paused = verb[0] == 'p';
+    else if (!strcmp(verb, "mute") || !strcmp(verb, "unmute"))
+        muted = verb[0] == 'm';
     else if (!strcmp(verb, "drop") || !strcmp(verb, "noise") || !strcmp(verb, "lose"))
         return set_wire(one, strtoul(two, NULL, 10), verb[0]);
     else if (!strcmp(verb, "type")) {
         for (; *one; one++)
             incoming[incoming_head++ % QUEUE] = (uint8_t)*one;
         incoming[incoming_head++ % QUEUE] = '\n';
-    } else if (!strcmp(verb, "encoder") || !strcmp(verb, "load"))
+    } else if (!strcmp(verb, "unplug"))
+        unplug();
+    else if (!strcmp(verb, "encoder") || !strcmp(verb, "load"))
         return set_motor(verb, one, two);
     else if (!strcmp(verb, "contact"))
         return set_contact(atoi(one), two);
@@ -830,7 +836,10 @@ static void obey(char *line)
         print_status();
     else if (!strcmp(verb, "bench"))
         bench(atol(one));
-    else
+    else if (!strcmp(verb, "plug")) {
+        unplug();
+        printf("{\"pty\":\"%s\"}\n", plug());
+    } else
         printf("{\"ok\":%s}\n", obeyed(verb, one, two) ? "true" : "false");
 }
 

@@ -11,7 +11,7 @@ import math
 import random
 import signal
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -20,7 +20,7 @@ import pytest
 
 from tests.firmware.board import MS, Board, Host, Identity, Status
 from tests.firmware.conftest import BUMPERS, ESTOP, FREE_SPEEDS, wire
-from tests.system.harness import ZERO, Bus, Commander, Daemon, Following, twist, until
+from tests.system.harness import ZERO, Bus, Commander, Daemon, Following, seconds, twist, until
 
 pytestmark = pytest.mark.firmware
 
@@ -32,6 +32,9 @@ ANGLE = math.tau / 3200
 
 COAST = 0.035
 """m. A wheel at 0.5 m/s rolls 25 mm without voltage."""
+
+JITTER = 0.01
+"""m at 0.5 m/s: the stamps of two samples may be 20 ms nearer than the samples were."""
 
 BOOT_NS = 1 * MS
 """After a reset the memory still shows the earlier wish for this time."""
@@ -159,6 +162,19 @@ def truly(status: Status) -> Path2D:
     return Path2D((right + left) / 2, (right - left) / TRACK)
 
 
+def leap(odom: Sequence[Any], fastest: float) -> float:
+    """Return the longest jump of the odometry, in m.
+
+    A jump is the distance between two messages beyond the distance at `fastest` m/s.
+    """
+    most = -math.inf
+    for before, after in itertools.pairwise(odom):
+        (x, y, _), (to_x, to_y, _) = pose(before), pose(after)
+        dt = seconds(after["header"]["stamp"]) - seconds(before["header"]["stamp"])
+        most = max(most, math.hypot(to_x - x, to_y - y) - fastest * dt)
+    return most
+
+
 class Errors(NamedTuple):
     """Relative errors of the odometry and the wheel angles, compared with the simulated motors."""
 
@@ -243,6 +259,76 @@ def test_when_the_daemon_is_killed_the_motors_stop(board: Board, tmp_path: Path)
 # the board ends
 
 
+def by_pin(board: Board) -> None:
+    """Reset the board as a person does who presses its reset button."""
+    board.command("reset")
+
+
+def by_a_hang(board: Board) -> None:
+    """Make the main loop of the firmware hang, so that the hardware watchdog resets the board."""
+    board.command("type !l")
+
+
+def unheard(board: Board) -> None:
+    """Reset the board through its pin, and lose the line that it sends after the boot."""
+    lines = board.status().from_board.lines
+    board.command("lose from 100")
+    board.command("reset")
+    board.waits(lambda status: status.from_board.lines > lines, "it has said that it booted")
+    board.command("lose from 0")
+
+
+@pytest.mark.parametrize(
+    ("how", "mcu", "unseen", "cause"),
+    [
+        (by_pin, CHECKED, 0.035, "pin"),
+        (unheard, PLAIN, 0.05, "pin"),
+        (by_a_hang, CHECKED, 0.1, "watchdog"),
+    ],
+    ids=["by its pin", "unreported", "by a hang"],
+)
+def test_a_board_that_restarts_while_driving_does_not_move_before_neutral(
+    runner: Path, hanging_firmware: Path, tmp_path: Path, how: Callable[[Board], None], mcu: Mcu,
+    unseen: float, cause: str,
+) -> None:  # fmt: skip
+    """The commander sends on all the time, and the odometry stays right.
+
+    `unseen` is the distance in m that the board does not report. The odometry may lack at most this
+    distance, and may not add any.
+    """
+    with Board(runner, hanging_firmware, "--free-speed", FREE_SPEEDS, live=True) as board:
+        with running(board, tmp_path, mcu) as (_, _, bus), bus.follow("odom") as odom:
+            with bus.commanding(0.5) as commander:
+                board.passes(200)
+                drives(board)
+                how(board)
+                off = board.waits(lambda status: status.resets > 0, "a reset")
+                assert not off.running
+                moves_nothing(board, off, 800)
+                state = bus.state()
+                assert (state["link"], state["mode"]) == ("up", "ready")
+                (waiting,) = [source for source in state["sources"] if source["name"] == "app"]
+                assert waiting["waits_for"].startswith("send a zero first")
+                coasted = truly(board.is_still())
+                gives_way(bus, commander)
+                drives(board)
+            true = truly(board.is_still())
+            bus.at_rest()
+            now = time.monotonic()
+            odom.find(lambda message: True, 3.0, "odometry at rest", after=now)
+        odometry = went([entry.value for entry in odom.seen])
+        most = leap([entry.value for entry in odom.seen], 0.5)
+        print(f"\n{how.__name__}: {true.distance:.3f} m, odometry "
+              f"{1000 * (odometry.distance - true.distance):+.1f} mm off; "
+              f"longest step {1000 * most:+.2f} mm beyond 0.5 m/s")  # fmt: skip
+        assert coasted.distance > 0.05
+        assert -unseen < odometry.distance - true.distance < 0.002
+        assert abs(odometry.yaw - true.yaw) < 0.02
+        assert most < JITTER
+        assert board.status().wrong == 0
+        assert account(board).reset == cause
+
+
 # the emergency stop
 
 
@@ -304,6 +390,68 @@ def test_a_press_at_the_robot_stops_it_and_clear_is_refused_until_the_release(
 
 
 # the wire
+
+
+def test_a_lost_link_is_restored_and_the_commander_must_be_neutral_first(
+    board: Board, tmp_path: Path
+) -> None:
+    """First the board falls silent, then its plug is pulled. The commander sends all the time.
+
+    The daemon restores the link, and the robot does not move until the commander sends zeros.
+    """
+    port = tmp_path / "mcu"
+    port.symlink_to(board.path)
+    with (
+        running(board, tmp_path, CHECKED, port) as (_, daemon, bus),
+        bus.commanding(0.5) as commander,
+        bus.follow("state") as states,
+    ):
+
+        def link(word: str, since: float) -> float:
+            """Wait until `state` reports this link. Return the time since `since` in ms."""
+            event = states.find(lambda state: state["link"] == word, 3.0, word, after=since)
+            return 1000 * (event.at - since)
+
+        drives(board)
+        at = time.monotonic()
+        board.command("mute")
+        stale = link("stale", at)
+        off = board.is_still()
+        stopped = (off.wanted_ns + off.base_ns) / MS - at * 1000
+        # After less than a second it would ramp up again by itself.
+        board.passes(1200)
+        at = time.monotonic()
+        board.command("unmute")
+        back = link("up", at)
+        moves_nothing(board, off, 600)
+        print(f"\nmute -> stale {stale:.0f} ms, told to stop {stopped:.0f} ms; "
+              f"unmute -> up {back:.0f} ms")  # fmt: skip
+        assert stale < 200
+        assert stopped < 200
+        assert back < 600
+        gives_way(bus, commander)
+        drives(board)
+
+        at = time.monotonic()
+        port.unlink()
+        board.command("unplug")
+        down = link("down", at)
+        off = board.waits(lambda status: not status.running, "motors off")
+        silent = (off.off_ns - off.heard_ns) / MS
+        port.symlink_to(board.plug())
+        at = time.monotonic()
+        back = link("up", at)
+        moves_nothing(board, off, 600)
+        print(f"unplug -> down {down:.0f} ms, no voltage {silent:.0f} ms after the last byte; "
+              f"plug -> up {back:.0f} ms")  # fmt: skip
+        assert down < 250
+        assert silent <= 350
+        assert back < 1500
+        gives_way(bus, commander)
+        drives(board)
+        assert board.status().wrong == 0
+        assert daemon.process.poll() is None
+    assert account(board).refused <= 1, "a line that the plug cut"
 
 
 def test_on_a_bad_wire_the_robot_drives_on_without_a_wrong_speed_or_a_lost_distance(

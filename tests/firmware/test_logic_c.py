@@ -100,6 +100,15 @@ def test_a_steady_speed_is_measured_to_a_thousandth(
     )
 
 
+def test_the_measured_speed_of_a_wheel_that_stopped_falls_to_zero(library: Library) -> None:
+    windows = [TICKS // 100] * 50 + [TICKS // 1000] * 200
+    samples = list(measured(library, turning(1.0, 0.5), windows))
+    speeds = [value for _, value, *_ in samples[50:]]
+    assert speeds == sorted(speeds, reverse=True)
+    assert speeds[-1] == 0.0
+    assert next(ms for ms, value in enumerate(speeds, 1) if value == 0.0) <= 105
+
+
 @given(
     st.lists(st.tuples(st.integers(1, 60_000), st.sampled_from((-1, 1, 1))), max_size=200),
     st.lists(st.integers(9_000, 50_000), min_size=1, max_size=200),
@@ -166,6 +175,25 @@ def test_speeds_in_hundredths_are_rounded_and_clamped(library: Library, value: f
 # control
 
 
+def test_the_speed_loop_settles_without_overshoot_and_recovers_from_a_jam(
+    library: Library,
+) -> None:
+    c, pi = library.c, library.new("pi")
+    speed, most = 0.0, 0.0
+    for tick in range(400):
+        duty = c.pi_step(pi, 20.0, speed, False)
+        speed = duty * 50.0 + (speed - duty * 50.0) * math.exp(-0.005 / 0.05)
+        most = max(most, speed)
+        if tick == 199:
+            assert speed == pytest.approx(20.0, rel=0.01)
+    assert most < 20.0 * 1.03
+    for _ in range(1000):  # jammed: it pushes as hard as it can, and no further
+        duty = c.pi_step(pi, 20.0, 0.0, False)
+    assert duty == 1.0
+    freed = [c.pi_step(pi, 20.0, 40.0, False) for _ in range(20)]
+    assert freed[-1] < 0.0, "within 100 ms"
+
+
 @given(st.lists(st.tuples(st.floats(-99, 99), st.floats(-99, 99), st.booleans()), max_size=50))
 def test_the_duty_stays_within_its_limits_and_decays_to_zero_at_rest(
     library: Library, steps: list[tuple[float, float, bool]]
@@ -209,6 +237,13 @@ def test_a_bridge_reverses_only_at_rest_and_its_duty_rises_slowly_and_falls_at_a
             assert rested > REVERSE_TICKS, "nor voltage in the tick in which they change"
         rested = 0 if bridge.duty else rested + 1
         driven = bridge.direction if bridge.duty else driven
+
+
+def test_a_bridge_that_keeps_its_direction_resumes_without_a_rest(library: Library) -> None:
+    bridge = library.new("bridge")
+    for wanted, duty in ((TOP, 0), (TOP, TOP // 10), (0, 0), (TOP, TOP // 10)):
+        library.c.bridge_step(bridge, wanted)
+        assert bridge.duty == duty
 
 
 # supervision
@@ -277,7 +312,20 @@ class Wheel:
         return False
 
 
+BACKWARDS = -1
+
 DEAD = 0
+
+
+@each("lag", [0.02, 0.05, 0.2, 0.5])
+@each("start", [3.0, -3.0, 0.5, 20.0])
+def test_a_wheel_with_its_encoder_backwards_is_switched_off(
+    library: Library, lag: float, start: float
+) -> None:
+    wheel = Wheel(library, lag=lag, encoder=BACKWARDS)
+    assert wheel.run(start, 100) or wheel.run(0.0, 2000), "though it shall stand"
+    print(f"lag {lag}, {start} rad/s for 100 ms, then zero: off after {wheel.off_ms} ms")
+    assert lag > 0.05 or wheel.off_ms <= 500
 
 
 @pytest.mark.parametrize("target", [3.0, 20.0, -45.0])

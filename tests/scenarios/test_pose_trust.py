@@ -189,3 +189,20 @@ def test_a_robot_that_was_unplugged_for_long_drives_on_and_its_pose_can_be_set(
     assert world.call("set_pose", b'{"x": 1.0, "y": 2.0, "yaw": 0.0}').success
     world.run(0.5)
     assert world.odom.pose.covariance[0] < 1e-4
+
+
+@pytest.mark.parametrize("link_check", ["off", "on"])
+@pytest.mark.parametrize("speed", [(0.4, 0.0), (-0.4, 0.0), (0.0, 1.5)])
+def test_the_doubt_of_a_long_silence_in_a_drive_is_bounded(
+    speed: tuple[float, float], link_check: Any
+) -> None:
+    world = World(Config(mcu=McuConfig(link_check=link_check, encoder_counts=3200)))
+    world.run(1.5)
+    world.drive(*speed, seconds=2.0)
+    with world.mcu.fault("mute"):
+        world.hold(*speed, seconds=0.2)
+        world.hold(0.0, 0.0, 120.0)
+    world.hold(0.0, 0.0, 1.0)
+    covariance = world.odom.pose.covariance
+    assert covariance[0] < 10.5**2
+    assert covariance[35] < 3.8**2

@@ -9,9 +9,11 @@ import numpy as np
 import pytest
 from msgspec import structs
 
-from acsard.calibration.log import Log, LogError, Notes, Run, run_of
+from acsard.calibration.log import Log, LogError, Notes, Run, read, run_of
 from acsard.calibration.result import Result, calibrate, text
 from acsard.core.config.settings import Config, DriveConfig, OdometryConfig
+from tests.unit.calibration_robots import GUIDED, Robot
+from tests.unit.calibration_robots import drive as driven
 from tests.unit.test_calibration_matches import DRIVE, RIGHT, TRACK, log
 
 
@@ -138,6 +140,12 @@ def test_a_drive_that_no_robot_makes_is_refused() -> None:
     assert calibrated(stretched(run, 20.0)).better  # a robot that starts slowly
 
 
+@pytest.mark.slow
+def test_a_robot_that_stands_for_nearly_all_of_a_log_is_calibrated() -> None:
+    rows = driven(Robot(rng=np.random.default_rng(3)), [(1700.0, 0.0, 0.0), *GUIDED])
+    assert calibrate(read(rows.csv(places=False).encode()), Config(), "a.csv").better
+
+
 def test_sensors_of_two_robots_contradict_each_other() -> None:
     run = log("gyro", "positions")
     assert calibrated(run).better
@@ -146,6 +154,21 @@ def test_sensors_of_two_robots_contradict_each_other() -> None:
     assert words.startswith("yaw_rate and x, y contradict each other: the track is 1.8")
     assert "by yaw_rate and 1." in words
     assert words.endswith("Leave the column of the wrong sensor out")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("scale", [0.98, 1.02])
+def test_a_sound_sensor_that_confirms_the_configuration_is_not_left_out(scale: float) -> None:
+    """The gyro's scale is wrong by less than its share."""
+    sound = Robot(
+        chi=1.5, rate=0.0, left=1.0, right=1.0, place_noise=0.004, outliers=0.02,
+        rng=np.random.default_rng(0),
+    )  # fmt: skip
+    rows = driven(sound, GUIDED)
+    rows.gyro *= scale
+    right = drive(wheel_separation_multiplier=1.5)
+    with pytest.raises(LogError, match="nothing to write"):
+        calibrate(read(rows.csv().encode()), right, "a.csv")
 
 
 def test_a_sensor_with_too_few_values_is_left_out_with_a_note() -> None:

@@ -10,6 +10,7 @@ from acsard.core.config.settings import DriveConfig, FeedbackConfig, WheelMap
 from acsard.core.link.feedback import Line
 from acsard.core.motion.gyro import Turn
 from acsard.core.motion.kinematics import Kinematics
+from acsard.core.motion.sides import CommandRange
 from acsard.core.motion.wheels import count_angle, new_wheels
 from acsard.core.values import WHEELS, WheelSpeeds
 from tests.each import each
@@ -285,13 +286,40 @@ def test_the_speed_before_a_long_silence_is_no_motion_behind_it(
     """A hand turned the wheels, for too short a time for a fault."""
     bench = Bench(counts, wheels=wheels).driven(1.0)
     bench.run(before, 0.0, 0.2)
-    bench.wheels.tell(speeds_of(after), silence)
+    bench.wheels.add_command(speeds_of(after), silence)
     bench.wheels.commanded, bench.wheels.unseen = speeds_of(after), silence
     bench.wheels.add(
         (0.0,) * 4, speeds_of(after), 0.0, None, bench.feedback, bench.kinematics, bench.count
     )  # the first line behind a long silence has no time of its own
     bench.run(after, after, 3.0)
     assert bench.faults == []
+
+
+# what a silence may hide
+
+
+@pytest.mark.parametrize(
+    ("commands", "seconds", "least", "most"),
+    [
+        ([(4.0, 0.01)] * 10, 0.1, 0.4, 0.4),  # constant, and no line is late
+        ([(4.0, 0.2), (0.0, 0.1)], 0.3, 0.8, 1.2),  # it came to rest, or went on
+        ([(0.0, 0.1), (4.0, 0.1), (0.0, 0.1)], 0.3, 0.0, 0.8),  # it came and went
+        ([(4.0, 0.1), (-4.0, 0.2)], 0.3, -0.4, 1.2),  # it changed its sign
+        ([(-4.0, 0.6)], 0.6, -2.4, -1.2),  # a stall: the board stops after 0.3 s
+        ([(4.0, 0.1)], 0.6, 1.6, 2.4),  # the last line is not the end
+        ([(4.0, 0.1)] + [(0.0, 0.1)] * 600, 60.0, 0.4, 4.0),  # a second of it
+        ([(0.0, 30.0), (4.0, 30.0)], 60.0, 0.0, 0.0),
+    ],
+)
+def test_a_silence_may_hide_what_any_of_its_commands_turn_the_wheels(
+    commands: list[tuple[float, float]], seconds: float, least: float, most: float
+) -> None:
+    found = CommandRange(commands[0][0], commands[0][0])
+    for speed, s in commands:
+        found = found.extended(speed, s)
+    found = found.until(seconds)
+    assert (found.least, found.most) == pytest.approx((least, most))
+    assert abs(found.margin) == pytest.approx((most - least) / 2)
 
 
 # wheels that the pose leaves out

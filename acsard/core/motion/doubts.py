@@ -6,9 +6,9 @@ in the covariance, the deviation of the distance is the difference's share of th
 the motor, and a slope that the robot drives up and down, give it back. A large difference is said,
 too. Two wheels of a side that contradict each other are in doubt by half of their difference.
 
-In a silence the board may have obeyed any command of that time, or have stopped (`Told`). So the
-middle of what it may have done is compared, and half of the range is a doubt beside it. Both are
-kept apart: the lines around a silence tell nothing of it, and take nothing of its doubt back.
+In a silence the board may have obeyed any command of that time (`CommandRange`). So the middle of
+what it may have done is compared, and half of the range is a doubt beside it. Both are kept apart:
+the lines around a silence tell nothing of it, and take nothing of its doubt back.
 """
 
 from __future__ import annotations
@@ -96,7 +96,7 @@ class Found(NamedTuple):
     """Angles that the pose may have missed, rad."""
 
     astray: Wheels4  # of the sides
-    reach: Wheels4  # of the sides, in a silence
+    margin: Wheels4  # of the sides, in a silence
     silent: bool  # a silence may be the cause
     wheels: list[tuple[SideName, Wheels4]]  # of a side whose wheels contradict each other
 
@@ -111,7 +111,7 @@ class Doubts(Struct):
     seconds: Seconds = 0.0
     unknown: bool = False  # an emergency stop may have cut the power
     silent: bool = False  # a line ended a silence
-    reach: tuple[Rad, Rad] = (0.0, 0.0)  # of the sides in it, more or less than `commanded`
+    margin: tuple[Rad, Rad] = (0.0, 0.0)  # of the sides in it, more or less than `commanded`
 
     @property
     def differs(self) -> bool:
@@ -123,10 +123,10 @@ class Doubts(Struct):
         left, right = self.commanded
         if wheels.unseen:
             self.silent = True
-            of_left, of_right = (side.told_in_silence.until(seconds) for side in wheels.sides)
+            of_left, of_right = (side.commands_in_silence.until(seconds) for side in wheels.sides)
             self.commanded = left + of_left.middle, right + of_right.middle
-            left, right = self.reach
-            self.reach = left + of_left.half, right + of_right.half
+            left, right = self.margin
+            self.margin = left + of_left.margin, right + of_right.margin
         elif wheels.commanded is None:
             self.unknown = True
         else:
@@ -142,7 +142,7 @@ class Doubts(Struct):
     def update(self, wheels: Wheels, lag: Seconds, count: Rad) -> Found:
         """End the open lines, and return what is in doubt now."""
         s, rolled, used = self.seconds, self.rolled, self.used
-        astray, reach, silent = AT_REST, AT_REST, False
+        astray, margin, silent = AT_REST, AT_REST, False
         wheels_astray = list[tuple[SideName, Wheels4]]()
         trails = (self.left, self.right)
         for trail, side, commanded in zip(trails, wheels.sides, self.commanded, strict=True):
@@ -163,11 +163,11 @@ class Doubts(Struct):
             silent, self.silent = self.silent, False
             left, right = (trail.take(lag, count, said=not silent) for trail in trails)
             astray = right, left, left, right
-            (left, right), self.reach = self.reach, (0.0, 0.0)
-            reach = right, left, left, right
+            (left, right), self.margin = self.margin, (0.0, 0.0)
+            margin = right, left, left, right
         self.commanded, self.seconds, self.unknown = (0.0, 0.0), 0.0, False
         self.rolled = self.used = AT_REST
-        return Found(astray, reach, silent, wheels_astray)
+        return Found(astray, margin, silent, wheels_astray)
 
     def forget(self) -> None:
         """Forget all doubts: the pose was set."""

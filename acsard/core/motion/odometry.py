@@ -190,9 +190,9 @@ class Odometry(Struct):
                 of_way, of_turn = SILENT if found.silent else USUAL
                 uncertainty.miss(of_way, distance, 0.0, heading)
                 uncertainty.miss(of_turn, 0.0, turns * angle, heading)
-            if found.reach != AT_REST:
-                distance, angle = model.kinematics.moved(found.reach)
-                uncertainty.miss("silent reach", distance, turns * angle, heading)
+            if found.margin != AT_REST:
+                distance, angle = model.kinematics.moved(found.margin)
+                uncertainty.miss("silent range", distance, turns * angle, heading)
             for side, angles in found.wheels:
                 distance, angle = model.kinematics.moved(angles)
                 uncertainty.miss(side, distance, turns * angle, heading)

@@ -12,6 +12,7 @@ from typing import Literal, NamedTuple
 
 from msgspec import Struct, field
 
+from acsard.core.link.feedback import MAX_FILLED_GAP_S
 from acsard.core.link.link_state import WATCHDOG_S
 from acsard.core.motion.obedience import AGREEMENT, Expected
 from acsard.core.values import WHEELS, Event, Rad, RadPerS, Seconds, Wheels4
@@ -41,35 +42,40 @@ OUT_TEXTS = {
 }
 
 
-class Told(Struct, frozen=True):
-    """The commands of a time, of which the board may have obeyed any, each at most until its end.
+class CommandRange(Struct, frozen=True):
+    """The commands of a time, of which the board may have obeyed any, and what that may turn.
 
-    Without lines, it stops after `WATCHDOG_S`.
+    Without a line, it stops after `WATCHDOG_S`. Beyond `MAX_FILLED_GAP_S`, nothing is added: then a
+    gap has a doubt of its own.
     """
 
-    slowest: RadPerS = 0.0
-    fastest: RadPerS = 0.0
+    low: RadPerS = 0.0
+    high: RadPerS = 0.0
     seconds: Seconds = 0.0
-    least: Rad = 0.0  # that the wheels may have turned in it
+    least: Rad = 0.0  # by which the wheels may have turned
     most: Rad = 0.0
 
-    def then(self, command: RadPerS, s: Seconds) -> Told:
-        """Return these, and a command of `s`."""
-        slow, *_, fast = sorted((self.slowest, self.fastest, command), key=abs)
-        least, most = self.least + slow * min(s, WATCHDOG_S), self.most + fast * s
-        return Told(slow, fast, self.seconds + s, least, most)
+    def extended(self, command: RadPerS, s: Seconds) -> CommandRange:
+        """Return this, and a command that lasted for `s`."""
+        low, high = min(self.low, command), max(self.high, command)
+        turning = min(s, max(0.0, MAX_FILLED_GAP_S - self.seconds))
+        surely = min(turning, WATCHDOG_S)
+        least = self.least + low * (surely if low > 0.0 else turning)
+        most = self.most + high * (surely if high < 0.0 else turning)
+        return CommandRange(low, high, self.seconds + s, least, most)
 
-    def until(self, s: Seconds) -> Told:
-        """Return these for at least `s`."""
-        return self.then(self.fastest, max(0.0, s - self.seconds))
+    def until(self, s: Seconds) -> CommandRange:
+        """Return this for at least `s`."""
+        return self.extended(self.high, max(0.0, s - self.seconds))
 
     @property
     def middle(self) -> Rad:
         return (self.least + self.most) / 2
 
     @property
-    def half(self) -> Rad:
-        return (self.most - self.least) / 2
+    def margin(self) -> Rad:
+        """By how much the angle may differ from `middle`, with its sign."""
+        return math.copysign((self.most - self.least) / 2, self.middle)
 
 
 class Block(NamedTuple):
@@ -91,8 +97,8 @@ class Side(Struct):
     expected: RadPerS = 0.0  # behind the whole response time
     halfway: RadPerS = 0.0  # behind half of it
     due: Expected = field(default_factory=Expected)
-    told: Told = field(default_factory=lambda: Told())  # since the last line
-    told_in_silence: Told = field(default_factory=lambda: Told())  # before the block
+    commands: CommandRange = CommandRange()  # since the last line
+    commands_in_silence: CommandRange = CommandRange()  # before the block
     angle: Rad = 0.0  # commanded since the last step, and the same behind the lags
     half_angle: Rad = 0.0
     whole_angle: Rad = 0.0

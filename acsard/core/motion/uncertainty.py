@@ -70,9 +70,9 @@ NO_EFFECT: Effect = (0.0, 0.0, 0.0, 0.0)
 
 # Causes of an error that do not average out. The motion that the pose may have missed is that of
 # gaps, and the differences of gyro and wheels, of the wheels and their commands (`way` and `turn`),
-# the same of silences, what the board may have done in one (`reach`), and of the wheels of a side.
+# the same of silences, what the board may have done in one (`range`), and of the wheels of a side.
 Missed = Literal[
-    "gap", "gyro", "way", "turn", "silent way", "silent turn", "silent reach", "left", "right"
+    "gap", "gyro", "way", "turn", "silent way", "silent turn", "silent range", "left", "right"
 ]
 RATIO, TRACK, SCALE, GYRO = PARAMETERS = range(4)
 MISSED: dict[Missed, int] = {cause: len(PARAMETERS) + i for i, cause in enumerate(get_args(Missed))}

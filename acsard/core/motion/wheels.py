@@ -34,8 +34,8 @@ from acsard.core.motion.sides import (
     PARTNER_S,
     PARTNER_S_PER_RAD,
     Block,
+    CommandRange,
     Side,
-    Told,
 )
 from acsard.core.motion.standstill import COMMANDED, Standstill
 from acsard.core.motion.wheel import REST_S, Wheel
@@ -134,7 +134,7 @@ class Wheels(Struct):
             self._end_block(feedback, kinematics, count)
             self.commanded = commanded
             for side in self.sides:
-                side.told_in_silence = side.told
+                side.commands_in_silence = side.commands
             self._heed()
             self.silent_s, self.speeds = self.unseen, speeds
             self.covered, self.covered_s = times(speeds.as_tuple(), dt), dt
@@ -162,15 +162,15 @@ class Wheels(Struct):
             return
         self._end_block(feedback, kinematics, count)
 
-    def tell(self, commanded: WheelSpeeds, s: Seconds) -> None:
-        """Take what was commanded until now for `s`, with or without lines."""
+    def add_command(self, commanded: WheelSpeeds, s: Seconds) -> None:
+        """Add what was commanded for `s` until now, with or without lines."""
         for side, speed in zip(self.sides, _of_sides(commanded), strict=True):
-            side.told = side.told.then(speed, s)
+            side.commands = side.commands.extended(speed, s)
 
     def _heed(self) -> None:
         self.heeded = commanded = self.commanded
         for side, speed in zip(self.sides, _of_sides(commanded or STILL), strict=True):
-            side.told = Told(speed, speed)
+            side.commands = CommandRange(speed, speed)
 
     def forget(self) -> None:
         """Drop the evidence of faults: one was cleared."""
@@ -281,12 +281,12 @@ class Wheels(Struct):
             self._obey(block.unit)
         pairs = zip(self.wheels, ends, strict=False)
         speeds = [_nearer(wheel.speed, speed) if short else 0.0 for wheel, speed in pairs]
-        told = [side.told_in_silence for side in self.sides]
+        ranges = [side.commands_in_silence for side in self.sides]
         before = [
-            (some.slowest, some.fastest, *side.smooth)
-            for some, side in zip(told, self.sides, strict=True)
+            (of_side.low, of_side.high, *side.smooth)
+            for of_side, side in zip(ranges, self.sides, strict=True)
         ]
-        if any(abs(some.fastest) >= COMMANDED for some in told):
+        if any(max(of_side.high, -of_side.low) >= COMMANDED for of_side in ranges):
             for wheel in self.wheels:
                 wheel.end_rest()
         if not short:

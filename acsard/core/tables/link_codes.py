@@ -193,7 +193,7 @@ WARN port: unknown board
     file to /etc/udev/rules.d
 WARN port: slow
     the FTDI chip of the port delays bytes by {timer} ms
-    -> until the next start of this computer: `echo 1 | sudo tee {file}`; for good, install
+    -> until its plug or this computer restarts: `echo 1 | sudo tee {file}`; for good, install
     deploy/udev/70-acsar.rules
 """,
 )
