@@ -154,7 +154,7 @@ def examined(
     if fact:
         runs, notes = [without(run, "gyro") for run in runs], [f"yaw_rate is left out: {fact}"]
     matches = {sensor: matched(sensor, runs, base) for sensor in sensors(runs)}
-    odd = {s: m for s, m in matches.items() if not (m.given and m.follows) or m.bad}
+    odd = {s: m for s, m in matches.items() if not m.given or m.unexplained > POOR or m.bad}
     for cause in _facts(runs, odd) if odd else ():
         raise LogError(cause)
     best = min((match.unexplained for match in matches.values()), default=0.0)

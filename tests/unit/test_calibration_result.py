@@ -14,6 +14,8 @@ from acsard.calibration.result import Result, calibrate, text
 from acsard.core.config.settings import Config, DriveConfig, OdometryConfig
 from tests.unit.calibration_robots import GUIDED, Robot
 from tests.unit.calibration_robots import drive as driven
+from tests.unit.planted_logs import log as planted_log
+from tests.unit.planted_logs import outcome
 from tests.unit.test_calibration_matches import DRIVE, RIGHT, TRACK, log
 
 
@@ -169,6 +171,12 @@ def test_a_sound_sensor_that_confirms_the_configuration_is_not_left_out(scale: f
     right = drive(wheel_separation_multiplier=1.5)
     with pytest.raises(LogError, match="nothing to write"):
         calibrate(read(rows.csv().encode()), right, "a.csv")
+
+
+@pytest.mark.slow
+def test_a_side_that_is_dead_for_half_of_a_log_is_named_although_positions_fit_roughly() -> None:
+    fault = "dead from half"
+    assert outcome(planted_log(fault, "positions", 9300), 9300, fault) == "named"
 
 
 def test_a_sensor_with_too_few_values_is_left_out_with_a_note() -> None:
