@@ -89,7 +89,8 @@ def test_robots_stop_when_their_router_is_killed_and_only_a_live_program_drives_
         if away_s:
             until(lambda: "send a zero first" in first.state()["reason"], 10.0, "it waits")
         else:
-            first.comes_to("driving")
+            # Its program connects again later than its robot.
+            until(lambda: first.state()["mode"] == "driving", 20.0, "it drives on")
         second.at_rest()
         assert third.state()["mode"] == "stopped"
         going.silence()
