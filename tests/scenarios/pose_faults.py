@@ -55,6 +55,7 @@ class Case(Struct, frozen=True):
     wheels: WheelMap = FOUR
     gyro: bool = False
     counts: int = 3200
+    declared: bool = True
     checked: bool = False
     silence: float = 0.0
     """In each second, s; the daemon stalls in it, unless the board is `mute`."""
@@ -62,7 +63,8 @@ class Case(Struct, frozen=True):
 
     @property
     def name(self) -> str:
-        sensors = f"{self.counts} counts" + ", gyro" * self.gyro + ", checked" * self.checked
+        sensors = f"{self.counts} counts" + " not declared" * (not self.declared)
+        sensors += ", gyro" * self.gyro + ", checked" * self.checked
         if self.silence:
             sensors += f", {'mute' if self.mute else 'stalled'} {self.silence} s"
         return (
@@ -97,6 +99,10 @@ def cases() -> Iterator[Case]:
                 groups = [one, "left", "all"] if len(names) == 4 else [one, "all"]
             for which in groups:
                 yield Case(fault, which, drive, wheels, gyro)
+    encoders = product(MAPS, DRIVES, ENCODERS, ((3200, False), (64, False), (20, True)))
+    for wheels, drive, fault, (counts, declared) in encoders:
+        for which in ("left", "all"):
+            yield Case(fault, which, drive, wheels, counts=counts, declared=declared)
     silences = product(MAPS, DRIVES, ENCODERS, (0.3, 0.6), (False, True), (False, True))
     for wheels, drive, fault, silence, mute, checked in silences:
         for which in ("left", "all"):
@@ -152,8 +158,9 @@ def begin(world: World, case: Case, stack: ExitStack) -> None:
 
 def run(case: Case) -> Result:
     settings = McuConfig(
-        wheels=case.wheels, encoder_counts=case.counts, link_check="on" if case.checked else "off"
-    )
+        wheels=case.wheels, encoder_counts=case.counts * case.declared,
+        link_check="on" if case.checked else "off",
+    )  # fmt: skip
     odometry = replace(CALIBRATED, gyro=case.gyro)
     config = Config(mcu=settings, odometry=odometry, sim=SimConfig(encoder_counts=case.counts))
     world = World(config, gyro=ImperfectGyro(bias=0.01, noise=0.005) if case.gyro else None)

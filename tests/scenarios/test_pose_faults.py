@@ -28,6 +28,9 @@ SOME = [
     Case("dead encoder", "left", "slalom", checked=True, silence=0.6),
     Case("twice", "all", "to and fro", TWO, checked=True, silence=0.6),
     Case("reversed encoder", "left", "turning", silence=0.3, mute=True),
+    Case("reversed encoder", "left", "to and fro", declared=False),
+    Case("half", "left", "straight", TWO, declared=False),
+    Case("twice", "left", "straight", counts=20), Case("half", "all", "straight", counts=16),
 ]  # fmt: skip
 
 

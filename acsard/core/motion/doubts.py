@@ -23,9 +23,10 @@ from acsard.core.motion.sides import SideName, lagged
 from acsard.core.motion.wheels import Wheels
 from acsard.core.values import Rad, RadPerS, Seconds, Wheels4
 
-# A step is long enough for a comparison after these counts, or this time.
-STEP_COUNTS, STEP_S = 6.0, 1.0
-NOISE_COUNTS = 1.5  # of an angle
+# A step is long enough for a comparison after this angle, or this time. With coarse encoders its
+# difference may be theirs: then the next step takes it back.
+STEP_ANGLE, STEP_S = 0.1, 1.0
+NOISE_ANGLE = 0.025
 
 # A difference is said beyond this share of the recent way, this time at the fastest speed, beside
 # the response time, and these counts.
@@ -55,21 +56,23 @@ class Trail(Struct):
         self.shown += angle
         self.seconds += s
 
-    def disagrees(self, count: Rad) -> bool:
+    @property
+    def disagrees(self) -> bool:
         size = max(abs(self.due), abs(self.shown))
-        return abs(self.due - self.shown) > AGREEMENT * size + NOISE_COUNTS * count
+        return abs(self.due - self.shown) > AGREEMENT * size + NOISE_ANGLE
 
-    def ends(self, count: Rad) -> bool:
-        """Return whether the open step is long enough for a comparison."""
+    @property
+    def ends(self) -> bool:
+        """Whether the open step is long enough for a comparison."""
         size = max(abs(self.due), abs(self.shown))
-        return self.disagrees(count) or size >= STEP_COUNTS * count or self.seconds >= STEP_S
+        return self.disagrees or size >= STEP_ANGLE or self.seconds >= STEP_S
 
     def take(self, lag: Seconds, count: Rad, *, said: bool = True) -> Rad:
         """End the step, and return what is in doubt now, as one standard deviation.
 
         Of a silence, nothing is `said`: the wheels may have obeyed another command in it.
         """
-        more, disagrees, size = self.due - self.shown, self.disagrees(count), abs(self.due)
+        more, disagrees, size = self.due - self.shown, self.disagrees, abs(self.due)
         if not said:
             self.due = self.shown = self.seconds = 0.0
             return more
@@ -159,7 +162,7 @@ class Doubts(Struct):
                 half = (rolled[side.front] - rolled[side.rear]) / 2
                 wheels_astray.append((side.name, of_side(side.front, half)))
         # One side alone would be in doubt of a turn.
-        if self.left.ends(count) or self.right.ends(count):
+        if self.left.ends or self.right.ends:
             silent, self.silent = self.silent, False
             left, right = (trail.take(lag, count, said=not silent) for trail in trails)
             astray = right, left, left, right
