@@ -53,7 +53,7 @@ def test_a_robot_says_that_nobody_calibrated_it(wheels: WheelMap) -> None:
 
     (warning,) = warnings(world("uncalibrated").state)
     assert warning.brief == "not calibrated"
-    assert "`acsard calibrate`" in warning.text
+    assert "`acsard calibrate drive`" in warning.text
     assert world("uncalibrated").state.pose_doubt == "not_calibrated"
     assert [world(std).state.pose_doubt for std in (0.0, 0.3)] == ["", ""]
     assert world("uncalibrated", "sim").state.pose_doubt == ""

@@ -38,12 +38,12 @@ WARN encoder_counts_missing | pose doubtful
 WARN gyro_disagrees | pose doubtful
     gyro and wheels measure different turns: the heading is the gyro's, and its uncertainty includes
     the difference:
-    -> if the wheels do not slip, measure the track with `acsard calibrate`, let the robot stand so
-    that it learns the gyro's bias, and check that the gyro's z axis points up and that it sends
-    rad/s
+    -> if the wheels do not slip, measure the track with `acsard calibrate drive`, let the robot
+    stand so that it learns the gyro's bias, and check that the gyro's z axis points up and that it
+    sends rad/s
 WARN not_calibrated | not calibrated
     the robot is not calibrated, so the heading by its wheels is uncertain:
-    -> type `acsard calibrate`
+    -> type `acsard calibrate drive`
 WARN coarse_encoder | pose doubtful
     the encoders are coarse, and lines get lost or come after varying delays, so the pose may be far
     off:
@@ -78,6 +78,6 @@ WARN gyro_dead
 WARN gyro_not_believed
     the gyro is not used, because it measures much larger turns than the wheels
     -> check that the gyro's z axis points up, that its driver sends rad/s, and that its bias has
-    not changed; then measure the track width with `acsard calibrate`
+    not changed; then measure the track width with `acsard calibrate drive`
 """,
 )
