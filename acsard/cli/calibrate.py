@@ -61,7 +61,7 @@ and fast turns to both sides, and curves. The exit code is 1 if no value is bett
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
-    actions = parser.add_subparsers(title="actions", metavar="ACTION", required=True)
+    actions = parser.add_subparsers(title="actions", required=True)
     guided = actions.add_parser(
         "drive", help="drive the robot, guided by this terminal", description=DRIVE
     )

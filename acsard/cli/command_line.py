@@ -101,6 +101,8 @@ class _Parser(argparse.ArgumentParser):
             near = nearest(str(value), map(str, action.choices or ()))
             if near:
                 error.message = f"invalid choice: {value!r}; did you mean {near[0]}?"
+            elif action.dest == "verb":
+                error.message = f"invalid choice: {value!r}; `acsard --help` lists the subcommands"
             raise
 
 

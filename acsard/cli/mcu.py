@@ -50,7 +50,7 @@ again when the computer is idle.
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
-    actions = parser.add_subparsers(title="actions", metavar="ACTION", required=True)
+    actions = parser.add_subparsers(title="actions", required=True)
     check = actions.add_parser(
         "check",
         help="test the board's protocol, wheels, watchdog and handling of damaged lines, and print "

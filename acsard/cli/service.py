@@ -20,7 +20,7 @@ from acsard.terminal.output import show, table
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
-    actions = parser.add_subparsers(title="actions", metavar="ACTION", required=True)
+    actions = parser.add_subparsers(title="actions", required=True)
     for name, main, text in (
         ("install", main_install, "write the service's files, then enable and start the service"),
         ("uninstall", main_uninstall, "stop and disable the service, and remove its files"),

@@ -31,7 +31,7 @@ NAME = re.compile(r"(?!@)[A-Za-z0-9_ .:@+-]{1,64}")
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
-    actions = parser.add_subparsers(title="actions", metavar="ACTION", required=True)
+    actions = parser.add_subparsers(title="actions", required=True)
     init = actions.add_parser(
         "init",
         help="make a certificate authority, the robot's certificate and a client certificate for "

@@ -1,7 +1,8 @@
 """Courses that end at a distance or an angle, measured by `odom`. This module is pure.
 
 The speed falls with the rest of the way, to a speed so low that the robot stops within the
-tolerance: 5 mm and 0.5 degrees in the simulator. A robot that overshoots comes back.
+tolerance: 5 mm and 0.5 degrees in the simulator. A robot that overshoots comes back, unless `odom`
+jumped across the end: coarse encoders show no pose that is nearer.
 """
 
 from __future__ import annotations
@@ -24,6 +25,10 @@ class _Approach(NamedTuple):
         way = abs(left)
         speed = min(fastest, math.sqrt(2.0 * self.deceleration * way), self.gain * way)
         return math.copysign(max(self.slowest, speed), left)
+
+    def ends(self, left: float, before: float) -> bool:
+        # `before` was left before the last motion.
+        return abs(left) <= self.tolerance or (left * before < 0.0 and abs(left) <= abs(before))
 
 
 _LINEAR = _Approach(0.3, 2.0, 0.02, 0.002)
@@ -51,17 +56,20 @@ class Straight:
         position = odom.pose.pose.position
         self._x, self._y, self._yaw = position.x, position.y, odom.yaw
         self._distance, self._speed = distance, speed
+        self.left = self._before = distance
         self.odom(odom)
 
     def odom(self, odom: Odometry) -> None:
         position = odom.pose.pose.position
         x, y = position.x - self._x, position.y - self._y
-        self.left = self._distance - x * math.cos(self._yaw) - y * math.sin(self._yaw)
+        left = self._distance - x * math.cos(self._yaw) - y * math.sin(self._yaw)
+        if left != self.left:
+            self._before, self.left = self.left, left
         self._turned = math.remainder(odom.yaw - self._yaw, math.tau)
 
     @property
     def is_done(self) -> bool:
-        return abs(self.left) <= _LINEAR.tolerance
+        return _LINEAR.ends(self.left, self._before)
 
     @property
     def twist(self) -> Twist:
@@ -76,15 +84,17 @@ class Straight:
 
 class Turn:
     def __init__(self, odom: Odometry, angle: float, speed: float) -> None:
-        self.left, self._speed, self._yaw = angle, speed, odom.yaw
+        self._speed, self._yaw = speed, odom.yaw
+        self.left = self._before = angle
 
     def odom(self, odom: Odometry) -> None:
-        self.left -= math.remainder(odom.yaw - self._yaw, math.tau)
-        self._yaw = odom.yaw
+        turned = math.remainder(odom.yaw - self._yaw, math.tau)
+        if turned:
+            self._before, self.left, self._yaw = self.left, self.left - turned, odom.yaw
 
     @property
     def is_done(self) -> bool:
-        return abs(self.left) <= _ANGULAR.tolerance
+        return _ANGULAR.ends(self.left, self._before)
 
     @property
     def twist(self) -> Twist:

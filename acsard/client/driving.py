@@ -43,7 +43,7 @@ COURSE_PERIOD_S = 0.02  # between two looks at the odometry
 MAX_ODOM_AGE_S = 0.2  # of a speed on a course
 
 COURSE_TIMEOUT_S = 3.0  # without coming nearer to the end of a course
-MAYBE = "is it blocked, is a speed limit in force, or is an encoder count larger than this?"
+MAYBE = "is it blocked, or is a speed limit in force?"
 
 # What counts as nearer: this fraction of the rest, or on a long way this many m or rad.
 NEARER, MOST_NEARER = 0.01, 0.01

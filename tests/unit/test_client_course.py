@@ -34,14 +34,20 @@ PERIOD_S = 0.01
 
 
 class Robot:
-    """A robot at a pose that follows each command `delay_s` later, at most 1 m/s and 1 rad/s."""
+    """A robot at a pose that follows each command `delay_s` later, at most 1 m/s and 1 rad/s.
 
-    def __init__(self, delay_s: float, yaw: float = 0.0) -> None:
+    Its odometry shows each `count` (m) of a wheel on the line y = -2.
+    """
+
+    def __init__(self, delay_s: float, yaw: float = 0.0, count: float = 0.0) -> None:
+        self._count = count
         self.x, self.y, self.yaw = 3.0, -2.0, yaw
         self._commands = deque([REST] * round(delay_s / PERIOD_S))
 
     def odom(self) -> Odometry:
-        pose = Pose(Vector3(self.x, self.y), from_yaw(self.yaw))
+        count = self._count
+        x = count * math.floor(self.x / count) if count else self.x
+        pose = Pose(Vector3(x, self.y), from_yaw(self.yaw))
         zeros = [0.0] * 36
         return Odometry(
             Header(Time(12, 250_000_000), "odom"),
@@ -72,6 +78,16 @@ def test_a_straight_course_ends_within_five_millimetres(distance: float, delay_s
     way = math.hypot(robot.x - 3.0, robot.y + 2.0)
     assert way == pytest.approx(abs(distance), abs=0.005)
     assert robot.x - 3.0 == pytest.approx(distance * math.cos(2.5), abs=0.005)
+
+
+@each("distance", [0.3, -0.305, 0.311])
+@each("count", [0.008, 0.03])
+def test_a_straight_course_ends_within_a_count_of_coarse_encoders(
+    distance: float, count: float
+) -> None:
+    robot = Robot(0.05, count=count)
+    robot.follow(Straight(robot.odom(), distance, 0.3))
+    assert robot.x - 3.0 == pytest.approx(distance, abs=1.5 * count + 0.005)
 
 
 @each("degrees", [90.0, -720.0, 1.0, 0.0])
