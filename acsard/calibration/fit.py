@@ -16,8 +16,16 @@ import numpy as np
 import numpy.typing as npt
 from msgspec import Struct, field
 
+from acsard.calibration.comparison import (
+    HUBER,
+    MIN_ROLL,
+    STEP_S,
+    Match,
+    gyro_bias,
+    matched,
+    sensors,
+)
 from acsard.calibration.geometry import LEFT, RIGHT, TRACK, Base
-from acsard.calibration.hypotheses import HUBER, Match, gyro_bias, matched, sensors
 from acsard.calibration.log import LogError, Run
 from acsard.calibration.series import Complexes, Floats, Mask
 from acsard.core.config.settings import Config
@@ -31,10 +39,8 @@ SHARES = np.array([[-0.5, -0.5, 1.0], [-1.0, 1.0, 0.0], [0.5, 0.5, 0.0]])  # of 
 RADIUS_STD, TRACK_STD, DELAY_STD_S, LEVER_STD_M = 0.02, 1.0, 0.3, 0.2
 GYRO_STD = 0.004
 SIZE_STD = 0.05  # of both radii alike, if positions show them
-STEP_S = 1.0  # over which the turns of gyro and wheels are compared
-HEADING_STEP_S = 3.0  # the same of headings, for the report: an error is below half a turn
+HEADING_STEP_S = 3.0  # between two headings, for the report: an error is below half a turn
 GRID_S = 0.02  # of the wheels' path
-MIN_ROLL = 0.02  # rad, in a step; at rest there is nothing to compare
 HOLE_S, HOLE_PERIODS = 0.3, 8.0  # a hole in the samples of a gyro is longer than both
 
 FINEST = 1e-4  # rad or m, of any sensor
@@ -46,13 +52,15 @@ PIECES = 12  # at least
 WHOLE_S = 60.0
 MIN_RUNS = 3  # of which each is left out whole, and not a part of it, for the deviations
 FARTHEST = 3.0  # deviations of the prior, by which a piece that is left out moves a parameter
-# Halves of a log that contradict each other: sound ones differ by 1.7 deviations, or by 0.061.
-MIN_PIECES, HALVES, SURELY, MOST = 8, 0.08, 3.0, 0.6
+# Halves of a log contradict each other if they differ by more than both: those of sound ones
+# differ by 1.7 deviations, or by 0.061.
+HALVES_DEVIATIONS, HALVES_DIFFERENCE = 3.0, 0.08
+MIN_HALVED_PIECES, MAX_HALVES_DIFFERENCE = 8, 0.6
 
-SURE = 2.0  # standard deviations by which the new values must be better, or else by half
+BETTER_DEVIATIONS = 2.0  # by which the new values must be better, or else by half
 # ... or the values this far from the configured ones, by sensors: a person misreads a tape. Sound
 # robots: 5.9 and less; wrong by 1 %: 9 and more.
-FAR = 8.0
+FAR_DEVIATIONS = 8.0
 CAP = 10.0  # robust standard deviations: a residual of a run that was left out counts as at most
 AGREES = 2.0  # deviations of a reading by tape
 OTHER_TRACK, SHOWN = 0.4, 1.1  # a log that shows its track fits others worse, by this factor
@@ -264,12 +272,12 @@ class Problem:
         halves = 0.0
         # Two robots, loads or floors in one log are no scatter of one, so they widen it as a whole.
         ends = np.cumsum([piece.run.seconds for piece in self.pieces])
-        if "tape" not in self.sensors and len(ends) >= MIN_PIECES:
+        if "tape" not in self.sensors and len(ends) >= MIN_HALVED_PIECES:
             first = ends <= ends[-1] / 2
             moved = (found.without(first) - found.without(~first))[GEOMETRY]
             off = np.abs(SHARES @ moved)
-            if np.any(off > np.maximum(HALVES, SURELY * deviations(made))):
-                halves = min(float(off.max()), MOST)
+            if np.any(off > np.maximum(HALVES_DIFFERENCE, HALVES_DEVIATIONS * deviations(made))):
+                halves = min(float(off.max()), MAX_HALVES_DIFFERENCE)
                 made += np.outer(moved, moved) * (halves / off.max() / 2) ** 2
         return np.asarray(made), halves
 
@@ -352,8 +360,8 @@ class Fit(Struct, frozen=True):
     @property
     def better(self) -> bool:
         moved = self.p[GEOMETRY]
-        far = float(moved @ np.linalg.solve(self.covariance, moved)) > FAR**2
-        surely = self.gain > min(SURE * self.gain_std, math.log(2.0))
+        far = float(moved @ np.linalg.solve(self.covariance, moved)) > FAR_DEVIATIONS**2
+        surely = self.gain > min(BETTER_DEVIATIONS * self.gain_std, math.log(2.0))
         sure = surely or (far and self.readings is None)
         return sure and self.gain > 0.0 and self.worst > -WORSE
 

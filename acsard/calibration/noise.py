@@ -18,6 +18,7 @@ from msgspec import Struct
 from acsard.calibration.fit import (
     AHEAD,
     ASIDE,
+    BETTER_DEVIATIONS,
     BIAS,
     GYRO_DELAY,
     POSE_DELAY,
@@ -41,7 +42,6 @@ OUTLIER = 9.0  # variances of a squared error, above which it counts as this
 MEDIAN = 0.455  # of a chi-square of one degree of freedom, whose mean is 1
 MAX_ANGLE = 0.2  # rad, that errors of positions may turn half a window
 FLOOR = 1e-7  # of a variance per metre or radian
-SURE = 2.0
 
 Row = list[float]
 # Columns of the rows: what multiplies each variance, and the squared error.
@@ -219,7 +219,9 @@ def _fitted(rows: _Rows, stated: Floats) -> tuple[Floats, bool]:
                 - _likelihood(squares, features @ stated + sensor)
             )
     total = np.array(gains)
-    return variances, bool(total.sum() > SURE * math.sqrt(len(total)) * float(np.std(total)))
+    return variances, bool(
+        total.sum() > BETTER_DEVIATIONS * math.sqrt(len(total)) * float(np.std(total))
+    )
 
 
 def _likelihood(squares: Floats, variances: Floats) -> float:

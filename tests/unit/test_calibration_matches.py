@@ -13,8 +13,9 @@ import pytest
 from msgspec import structs
 
 from acsard.calibration import hypotheses
+from acsard.calibration.comparison import Match, Places, gyro_bias, matched, sensors, without
 from acsard.calibration.geometry import Base
-from acsard.calibration.hypotheses import Match, Places, examined, gyro_bias, matched, sensors
+from acsard.calibration.hypotheses import examined
 from acsard.calibration.log import LogError, Notes, Run, run_of
 from acsard.calibration.series import by_chance, by_turns, in_blocks
 from acsard.core.config.settings import Config, DriveConfig
@@ -297,7 +298,7 @@ def test_two_sensors_on_one_topic_are_left_out_beside_another(
     assert sensors([kept]) == ["positions"]
     assert note.startswith("yaw_rate is left out: yaw_rate is now -")
     with pytest.raises(LogError, match="Record only one of them"):
-        examined([hypotheses.without(run, "positions")], DRIVES)
+        examined([without(run, "positions")], DRIVES)
 
 
 STEADY = np.repeat([2.0, 0.0, -1.0, 3.0], 100)
@@ -309,14 +310,16 @@ def test_two_levels_beside_a_steady_series_are_two_writers() -> None:
     for factor in (0.0, 0.5, -1.0, 2.0):
         mixed = STEADY * np.where(by_turns_of_ten, factor, 1.0) + noise
         low, high = sorted((factor, 1.0))
-        words = in_blocks("a", mixed, "b", STEADY)
-        assert words.startswith(f"a is now {low:.2f}, now {high:.2f} times b, and changes 2")
-    assert in_blocks("a", STEADY + noise, "b", STEADY) == ""
+        levels = in_blocks(mixed, STEADY)
+        assert levels
+        assert (levels.low, levels.high) == pytest.approx((low, high), abs=0.01)
+        assert 20 <= levels.changes < 30
+    assert in_blocks(STEADY + noise, STEADY) is None
     # The factor changes with the other series, as of tyres that slip: four times are no proof.
     slips = STEADY * np.where(STEADY > 1.0, 0.5, 1.0)
-    assert in_blocks("a", slips + noise, "b", STEADY) == ""
-    assert in_blocks("a", STEADY[:10], "b", STEADY[:10]) == ""
-    assert in_blocks("a", STEADY[:0], "b", STEADY[:0]) == ""
+    assert in_blocks(slips + noise, STEADY) is None
+    assert in_blocks(STEADY[:10], STEADY[:10]) is None
+    assert in_blocks(STEADY[:0], STEADY[:0]) is None
 
 
 def test_sides_that_jump_by_one_factor_in_the_same_rows_are_of_two_writers() -> None:
