@@ -5,15 +5,18 @@ from __future__ import annotations
 import cmath
 import math
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import nullcontext
+from functools import partial
 from types import SimpleNamespace
+from typing import Any
 from unittest.mock import MagicMock
 
 import numpy as np
 import pytest
 from msgspec.structs import replace
 
+from acsard.calibration import guide
 from acsard.calibration.geometry import Base
 from acsard.calibration.guide import MAX_REPEATS, Options, drive, guided, require_own
 from acsard.calibration.leg import require_path
@@ -24,7 +27,7 @@ from acsard.calibration.series import Floats
 from acsard.core.config.parsing import effective, parse
 from acsard.core.config.settings import Config
 from acsard.core.values import AcsardError
-from acsard.host.errors import NoAnswerError, NotDrivenError
+from acsard.host.errors import NoAnswerError, NotDrivenError, UsageError
 from acsard.terminal.prompt import NumberQuestion, Prompt
 
 STEP_S, LINE_M, WHEELBASE_M, WIDTH_M = 0.02, 0.45, 0.25, 0.30
@@ -306,6 +309,100 @@ def test_a_robot_that_is_stopped_already_is_named_before_the_first_question() ->
     ]  # fmt: skip
     with pytest.raises(NotDrivenError, match="stopped by phone"):
         drive(client, Options("tape"), Prompt(), "", Config())
+
+
+class Rides:
+    """A daemon that answers queries, and the robot that a guided drive rides."""
+
+    def __init__(self, text: str = "", mode: str = "ready") -> None:
+        self.answers: dict[str, object] = {
+            "info": SimpleNamespace(simulated=True, version="1.2"),
+            "config": effective(parse(text.encode())),
+            "state": SimpleNamespace(mode=mode, why="stopped by phone"),
+        }
+        self.where = SimpleNamespace(robot_id="acsar", endpoint="tcp/a", tls=None)
+        self.session, self.robot, self.sensors = "the session", Robot(1.5), list[str]()
+        self.disturbs: Callable[[], None] = lambda: None
+
+    def get(self, name: str) -> Any:
+        return self.answers[name]
+
+    def key(self, name: str) -> str:
+        return f"acsard/acsar/{name}"
+
+    def add_gyro(self) -> None:
+        self.sensors.append("gyro")
+
+    def add_poses(self, key: str, session: object) -> None:
+        self.sensors.append(f"{key} of {session}")
+
+    def ride(self, leg: Leg) -> Run:
+        self.disturbs()
+        return self.robot.ride(leg)
+
+    def drive(self, monkeypatch: pytest.MonkeyPatch, options: Options) -> tuple[Log, Config]:
+        monkeypatch.setattr(guide, "Recorder", lambda client, config, prompt: self)
+        client: Any = self
+        return drive(client, options, self.robot, "", Config())
+
+
+@pytest.mark.parametrize(
+    ("text", "options", "sensors", "legs"),
+    [
+        ("", Options(), [], 4),
+        ("[odometry]\ngyro = true\n", Options(), ["gyro"], 2),
+        ("[odometry]\ngyro = true\n", Options(poses="mocap"), ["mocap of the session"], 2),
+        ("", Options(poses="sim/pose"), ["acsard/acsar/sim/pose of the session"], 2),
+        ("[odometry]\ngyro = true\n", Options("tape"), [], 4),
+    ],
+)
+def test_the_method_follows_from_the_options_and_the_gyro(
+    monkeypatch: pytest.MonkeyPatch, text: str, options: Options, sensors: list[str], legs: int
+) -> None:
+    robot = Rides(text)
+    log, config = robot.drive(monkeypatch, options)
+    assert robot.sensors == sensors
+    assert len(log.runs) == legs
+    assert config == parse(text.encode())
+
+
+def test_whatever_ends_a_guided_drive_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    def raises(error: BaseException) -> Callable[[], None]:
+        def disturb() -> None:
+            raise error
+
+        return disturb
+
+    robot = Rides()
+    robot.disturbs = raises(KeyboardInterrupt())
+    with pytest.raises(LogError, match="the operator ended the drive"):
+        robot.drive(monkeypatch, Options())
+    robot.disturbs = raises(NotDrivenError("a reason"))
+    with pytest.raises(NotDrivenError, match="a reason"):
+        robot.drive(monkeypatch, Options())
+
+    def stopped() -> None:
+        robot.answers["state"] = SimpleNamespace(mode="stopped", why="stopped by phone")
+        raise NotDrivenError("a reason")
+
+    robot.disturbs = stopped
+    with pytest.raises(NotDrivenError, match="stopped by phone"):
+        robot.drive(monkeypatch, Options())
+    for name, other in (
+        ("info", SimpleNamespace(simulated=False)),
+        ("config", effective(parse(b"[drive]\nwheel_radius = 0.06\n"))),
+    ):
+        robot = Rides()
+        robot.disturbs = partial(robot.answers.__setitem__, name, other)
+        with pytest.raises(LogError, match="another robot answers, or its settings were changed"):
+            robot.drive(monkeypatch, Options())
+    robot.answers["info"] = SimpleNamespace(simulated=False)
+    with pytest.raises(UsageError, match="--yes is only for the built-in simulator"):
+        robot.drive(monkeypatch, Options(without_person=True))
+    robot = Rides()
+    robot.answers["config"] = {"drive": {"wheel_radius": "a"}}
+    with pytest.raises(LogError, match=r"cannot read .* use the daemon's version, 1\.2"):
+        robot.drive(monkeypatch, Options())
 
 
 @pytest.mark.parametrize(
