@@ -254,7 +254,7 @@ def _parsed(data: bytes) -> _Table:
     header = [name.strip() for name in lines[0].split(",")] if lines else []
     used = _used(header)
     picks = [header.index(name) for name in used]
-    run = header.index("run") if "run" in header else -1
+    run = header.index("run") if "run" in header else None
     values, runs, labels = array("d"), array("q"), dict[str, int]()
     cut = False
     for number, line in enumerate(lines[1:], 2):
@@ -273,7 +273,7 @@ def _parsed(data: bytes) -> _Table:
                 f'line {number} is "{printable(line[:60])}", which is not a number or an empty '
                 f"cell for each of the {len(header)} columns: {ADVICE}"
             ) from None
-        runs.append(labels.setdefault(cells[run] if run >= 0 else "", len(labels)))
+        runs.append(labels.setdefault("" if run is None else cells[run], len(labels)))
     if not runs:
         raise LogError("there are no rows below the header: record a drive")
     if len(labels) > MAX_RUNS:
@@ -292,8 +292,8 @@ def _parsed(data: bytes) -> _Table:
 
 def _used(header: Sequence[str]) -> list[str]:
     wheels = FOUR if set(FOUR) <= set(header) else TWO
-    places = ("x", "y") if {"x", "y"} <= set(header) else ()
-    sensors = [name for name in ("yaw_rate", "yaw") if name in header] + [*places]
+    places = ("x", "y") if "x" in header and "y" in header else ()
+    sensors = [name for name in ("yaw_rate", "yaw", *places) if name in header]
     missing = [name for name in ("t", *wheels) if name not in header]
     if not sensors:
         missing.append("yaw_rate (of a gyro) or x and y (positions)")
