@@ -17,7 +17,7 @@ from msgspec.structs import replace
 
 from acsard.calibration.geometry import Base, path
 from acsard.calibration.log import Run
-from acsard.calibration.series import Complexes, Floats, Mask
+from acsard.calibration.series import TINY, Complexes, Floats, Mask
 from acsard.core.values import Seconds
 
 STEP_S, WINDOW_S, GRID_S = 1.0, 10.0, 0.05  # of turns, of positions, and of the wheels' path
@@ -25,7 +25,7 @@ MIN_SPOTS, MAX_SPOTS = 10, 2000  # positions of a window, and of a log
 SEARCH_S = 200.0  # of the parts that are searched
 APART_S = 60.0  # between two runs on their common axis of time
 MIN_ROLL, LEAST_TURN = 0.02, 1e-3  # rad, in a step that shows something
-HUBER = 1.5  # robust standard deviations, beyond which a position counts less
+HUBER = 1.5  # usual sizes, beyond which an error counts less
 BIAS_STD, REST_BIAS_STD, MIN_RESTS = 0.05, 1e-3, 20  # rad/s, of a gyro without and with rests
 CAP = 0.5  # rad, beyond which a turn counts as not explained
 HOLE_S, HOLE_PERIODS = 0.5, 8.0  # a hole in the samples of a sensor is longer than both
@@ -52,6 +52,11 @@ COLUMNS = {
     "gyro": ("gyro_t", "turned", "rate"), "headings": ("yaw_t", "yaw"),
     "positions": ("place_t", "place"),
 }  # fmt: skip
+
+
+def weights(off: Floats, size: float) -> Floats:
+    """Return the weights of errors whose usual size is `size`; larger ones count less."""
+    return np.asarray(np.minimum(1.0, (HUBER * size + TINY) / (np.abs(off) + TINY)))
 
 
 def _unwrapped(integral: Floats, t: Floats) -> Floats:
@@ -198,7 +203,7 @@ class Comparison:
         off, moved = (sums(values, known & rolls) for values in (off, moved))
         if bad.sum() > MAX_BAD * (bad | (moved > 0)).sum():
             bad[:] = False
-        share = np.clip(off, 0.0, moved)[~bad].sum() / max(1e-9, float(moved[~bad].sum()))
+        share = np.clip(off, 0.0, moved)[~bad].sum() / max(TINY, float(moved[~bad].sum()))
         run = np.searchsorted(self.shift, self.windows[0], side="right") - 1
         begin, end = (edge - self.shift[run] for edge in self.windows)
         spans = zip(run[bad].tolist(), begin[bad].tolist(), end[bad].tolist(), strict=True)
@@ -239,7 +244,7 @@ class Turns(Comparison):
         seen = np.array([self.seen(delay) for delay in delays])
         known = np.isfinite(seen)
         y, weight = np.where(known, seen, 0.0), known.astype(float)
-        ridge = np.diag([*[1e-9] * (len(columns) - 1), 1e-3])
+        ridge = np.diag([*[TINY] * (len(columns) - 1), 1e-3])
         for _ in range(ROUNDS):
             normal = np.einsum("dn,in,jn->dij", weight, columns, columns)
             normal += ridge * (1 + weight.sum(axis=1))[:, None, None]
@@ -252,7 +257,7 @@ class Turns(Comparison):
         moved = np.abs(y - shares[:, -1:] * bias)
         used = known & self.moving
         off, most = (np.minimum(values, CAP) * used for values in (off, moved))
-        share = np.minimum(off.sum(axis=1) / (most.sum(axis=1) + 1e-9), 1.0)
+        share = np.minimum(off.sum(axis=1) / (most.sum(axis=1) + TINY), 1.0)
         # A step that the delay loses is not explained.
         share = 1 - (1 - share) * used.sum(axis=1) / max(1, int(self.moving.sum()))
         at = int(np.argmin(cost(share, tracks, delays)))
@@ -261,7 +266,7 @@ class Turns(Comparison):
         off = np.abs(y[at] - shares[at, -1] * bias - wheels)
         off = np.where(known[at], off, np.minimum(moved[at], BAD_TURN))
         judged, bad = self.judged(self.begin, off, moved[at], self.moving, BAD_TURN)
-        ratio = 1.0 if even else float(shares[at, 1] / (shares[at, 0] or 1e-9))
+        ratio = 1.0 if even else float(shares[at, 1] / (shares[at, 0] or TINY))
         as_given = judged if track > 0.0 else 1.0
         return Match(
             self.sensor, judged, track, delay, raw, ratio, bad=bad, as_given=as_given
@@ -308,19 +313,19 @@ class Places(Comparison):
                 for v in (self.place, model, lever, turned)
             )  # fmt: skip
             turn = np.add.reduceat(weight * seen * turned.conj(), self.first)
-            turn = np.where(np.abs(turn) > 1e-9, turn, 1.0)  # of wheels that stand
+            turn = np.where(np.abs(turn) > TINY, turn, 1.0)  # of wheels that stand
             back = seen * (turn / np.abs(turn)).conj()[self.part]
             columns = np.array([m, e, 1j * e])
             # The threads of a matrix product cost more than they save here.
             normal = np.einsum("in,n,jn->ij", columns.conj(), weight, columns).real
-            normal += np.diag([1e-9, LEVER * len(at), LEVER * len(at)])
+            normal += np.diag([TINY, LEVER * len(at), LEVER * len(at)])
             score = np.einsum("in,n,n->i", columns.conj(), weight, back).real
             x = np.linalg.solve(normal, score)
             turned = x[0] * m + (x[1] + 1j * x[2]) * e
             off = np.abs(back - turned)
-            weight = np.minimum(1.0, (HUBER * np.median(off) + 1e-9) / (off + 1e-12))
+            weight = weights(off, float(np.median(off)))
         wrong, moved = (np.add.reduceat(v, self.first) for v in (off, np.abs(seen)))
-        return float(np.minimum(wrong, moved).sum() / max(1e-9, moved.sum())), x, off
+        return float(np.minimum(wrong, moved).sum() / max(TINY, moved.sum())), x, off
 
     def match(self, ratio: float = 1.0, *, wide: bool = False) -> Match:
         few = self.few

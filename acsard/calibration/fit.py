@@ -17,17 +17,17 @@ import numpy.typing as npt
 from msgspec import Struct, field
 
 from acsard.calibration.comparison import (
-    HUBER,
     MIN_ROLL,
     STEP_S,
     Match,
     gyro_bias,
     matched,
     sensors,
+    weights,
 )
 from acsard.calibration.geometry import LEFT, RIGHT, TRACK, Base
 from acsard.calibration.log import LogError, Run
-from acsard.calibration.series import Complexes, Floats, Mask
+from acsard.calibration.series import TINY, Complexes, Floats, Mask
 from acsard.core.config.settings import Config
 
 BIAS, SCALE, GYRO_DELAY, POSE_DELAY, AHEAD, ASIDE = range(TRACK + 1, TRACK + 7)
@@ -129,8 +129,7 @@ def centered(values: Floats) -> Floats:
     """Return values without their robust mean, which is smooth where a median jumps."""
     off = values
     for _ in range(3):
-        size = np.abs(off)
-        weight = np.minimum(1.0, HUBER * np.median(size) / np.maximum(size, 1e-12)) + 1e-12
+        weight = weights(off, float(np.median(np.abs(off))))
         off = values - weight @ values / weight.sum()
     return off
 
@@ -160,7 +159,7 @@ def aligned(seen: Complexes, model: Complexes) -> Alignment:
         off = a * turn.conjugate() - b
         size = np.abs(off)
         middle = np.partition(size, len(size) // 2)[len(size) // 2]  # np.median is slow
-        weight = np.minimum(1.0, HUBER * middle / np.maximum(size, 1e-12))
+        weight = weights(size, float(middle))
     return Alignment(turn, weight, off)
 
 
@@ -214,14 +213,14 @@ class Problem:
                 jacobian = np.array([(m[sensor] - e) / STEP for m in moved])
                 sound = np.isfinite(e) & np.isfinite(jacobian).all(axis=0)
                 e, jacobian = e[sound], jacobian[:, sound]
-                weight = np.minimum(1.0, HUBER * sizes[sensor] / np.maximum(np.abs(e), 1e-12))
+                weight = weights(e, sizes[sensor])
                 # The threads of a matrix product cost more than they save here.
                 normal[n, k] = np.einsum("in,jn->ij", jacobian * weight, jacobian)
                 curvature[n, k] = np.einsum("in,jn->ij", jacobian * (weight == 1.0), jacobian)
                 score[n, k] = -np.einsum("in,n->i", jacobian * weight, e)
                 squares[k] += (weight * e * e).sum(), len(e)
         for k, sensor in enumerate(self.sensors):
-            inner = np.linalg.pinv(normal[:, k].sum(axis=0), rcond=1e-9, hermitian=True)
+            inner = np.linalg.pinv(normal[:, k].sum(axis=0), rcond=TINY, hermitian=True)
             apart = score[:, k] - score[:, k].mean(axis=0)
             rank = max(1, int(np.linalg.matrix_rank(inner, hermitian=True)))
             scatter = float(np.einsum("bi,ij,bj->", apart, inner, apart)) / rank
@@ -243,7 +242,7 @@ class Problem:
             off = (p - self.mean)[self.free] / scale
             step = np.linalg.solve(normal.sum(axis=0) + prior, score.sum(axis=0) - prior @ off)
             step *= min(
-                1.0, 0.3 / max(1e-12, float(np.abs(step[: TRACK + 1] * scale[: TRACK + 1]).max()))
+                1.0, 0.3 / max(TINY, float(np.abs(step[: TRACK + 1] * scale[: TRACK + 1]).max()))
             )
             p[self.free] += step * scale
             if float(np.abs(step).max()) < CONVERGED:
@@ -312,7 +311,7 @@ class Solution(Struct):
 def _robust(residuals: Sequence[Floats]) -> float:
     joined = np.concatenate(residuals)
     joined = joined[np.isfinite(joined)]
-    return 1.4826 * float(np.median(np.abs(joined))) + 1e-9 if len(joined) else 1.0
+    return 1.4826 * float(np.median(np.abs(joined))) + TINY if len(joined) else 1.0
 
 
 def cut(runs: Sequence[Run], least: int = PIECES) -> list[Run]:
@@ -405,8 +404,8 @@ def _start(problem: Problem, matches: dict[str, Match]) -> Floats:
         delay = GYRO_DELAY if sensor == "gyro" else POSE_DELAY
         p[delay] = problem.mean[delay] = match.delay
         p[AHEAD : ASIDE + 1] += match.lever
-        p[LEFT:TRACK] += math.log(abs(match.size) + 1e-9)
-        p[TRACK] = math.log(abs(match.track) + 1e-9) + p[LEFT]
+        p[LEFT:TRACK] += math.log(abs(match.size) + TINY)
+        p[TRACK] = math.log(abs(match.track) + TINY) + p[LEFT]
     turns = [
         (piece.base.motion(p, *piece.rolls)[1].sum() / reading.value)
         for piece in problem.pieces for reading in piece.run.tape
@@ -434,7 +433,7 @@ def _judged(problem: Problem, solution: Solution, base: Base, gyro_std: float) -
     least = np.array([AGREES**2 if s == "tape" else 0.0 for s in problem.sensors])
 
     def gains(kept: Mask) -> Floats:
-        floor = least * counts[kept].sum(axis=0) + 1e-18
+        floor = least * counts[kept].sum(axis=0) + TINY**2
         now, new = np.maximum(squares[:, kept].sum(axis=1), floor)
         return np.asarray(np.log(now / new) / 2)
 
@@ -494,4 +493,4 @@ def _turn_errors(problem: Problem, solution: Solution) -> Errors:
                 off[k] += float(np.nansum(np.abs(piece.residuals(p)["gyro"])))
             elif len(piece.run.yaw_t) > 1:
                 off[k] += _heading_error(piece, p)
-    return Errors(*(off * math.tau / max(turned, 1e-9)).tolist())
+    return Errors(*(off * math.tau / max(turned, TINY)).tolist())

@@ -28,7 +28,7 @@ from acsard.calibration.comparison import (
 )
 from acsard.calibration.geometry import Base
 from acsard.calibration.log import MIXED, LogError, Run
-from acsard.calibration.series import in_blocks
+from acsard.calibration.series import TINY, in_blocks
 from acsard.core.config.settings import DriveConfig
 from acsard.core.values import Seconds
 
@@ -200,7 +200,7 @@ def _facts(runs: Sequence[Run], matches: Mapping[str, Match]) -> Iterator[str]:
                 "its cable loose?"
             )
     less, more = sorted(("left", "right"), key=lambda side: _rolled(runs, side))
-    if (ratio := _rolled(runs, more) / (_rolled(runs, less) + 1e-9)) > MAX_SIDE_RATIO:
+    if (ratio := _rolled(runs, more) / (_rolled(runs, less) + TINY)) > MAX_SIDE_RATIO:
         yield (
             f"{more} rolls {ratio:.0f} times as far as {less}, against {names}: is {more} a "
             "running count, or in another unit? Write both as speeds in rad/s"

@@ -21,6 +21,7 @@ from msgspec.structs import replace
 
 from acsard.calibration.series import (
     MIN_ROWS,
+    TINY,
     Complexes,
     Floats,
     Mask,
@@ -195,9 +196,9 @@ def with_distance(log: Log, name: str, metres: Metres) -> Log:
 
 
 def _straightness(run: Run) -> float:
-    left, right = (float(side[-1] - side[0]) for side in (run.left, run.right))
+    left, right = float(run.left[-1]), float(run.right[-1])
     rolled = max(float(np.abs(np.diff(side)).sum()) for side in (run.left, run.right))
-    alike = 1 - abs(left - right) / (abs(left) + abs(right) + 1e-9)
+    alike = 1 - abs(left - right) / (abs(left) + abs(right) + TINY)
     return alike * min(abs(left), abs(right)) / rolled if rolled > MIN_STRAIGHT else 0.0
 
 
@@ -434,7 +435,7 @@ def integral(t: Floats, values: Floats) -> Floats:
 def _without_stuck(notes: Notes, run: Run) -> Run:
     # Leave out a gyro that repeats one value to the last digit while the wheels' turn changes.
     rate = run.rate
-    if len(rate) < 2:
+    if not len(rate):
         return run
     begins = np.concatenate(([0], np.flatnonzero(np.diff(rate)) + 1))
     ends = np.concatenate((begins[1:], [len(rate)])) - 1

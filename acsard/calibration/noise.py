@@ -28,7 +28,7 @@ from acsard.calibration.fit import (
     aligned,
 )
 from acsard.calibration.log import Run
-from acsard.calibration.series import Complexes, Floats
+from acsard.calibration.series import TINY, Complexes, Floats
 from acsard.core.config.settings import OdometryConfig
 from acsard.core.values import Seconds
 
@@ -65,7 +65,7 @@ def noise(runs: Sequence[Run], fit: Fit, odometry: OdometryConfig, wheels: int =
     # Positions alone show the heading over long ways only, and so in whole runs.
     turns = {"gyro", "headings"} & set(fit.sensors)
     parts = [piece.run for piece in fit.pieces] if turns else runs
-    whole, passed = sum(run.seconds for run in parts) + 1e-9, 0.0
+    whole, passed = sum(run.seconds for run in parts) + TINY, 0.0
     for run in parts:
         for begin, heading, distance in _windows(run, fit):
             group = int(FOLDS * (passed + begin - run.t[0]) / whole)

@@ -15,6 +15,8 @@ Floats = npt.NDArray[np.float64]
 Complexes = npt.NDArray[np.complex128]
 Mask = npt.NDArray[np.bool_]
 
+TINY = 1e-9  # beside a divisor that may be 0
+
 MIN_ROWS = 8
 BACK, NOISES = 0.2, 12.0  # of the jump to a wrong value; of the quartile of all jumps
 FAR_SHARES, FAR_STEPS = 3.0, 5.0  # of the range of the values; of the usual step of positions
@@ -132,7 +134,7 @@ def in_blocks(values: Floats, other: Floats) -> Levels | None:
     low, high = np.quantile(share, [RARER, 1 - RARER])
     for _ in range(ROUNDS):
         upper = share > (low + high) / 2
-        if upper.all() or not upper.any():
+        if not upper.any():
             return None
         low, high = np.median(share[~upper]), np.median(share[upper])
     off, distance = np.abs(share - np.where(upper, high, low)), float(high - low)

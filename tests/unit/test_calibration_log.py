@@ -284,6 +284,31 @@ def test_the_straightness_that_a_distance_needs_is_90_percent() -> None:
                 with_distance(log, "1", 0.6)
 
 
+def test_a_measured_run_rolls_5_rad_at_least_ahead_or_back() -> None:
+    t = np.arange(0.0, 6.0, 0.05)
+    for rolled, straight in ((4.9, False), (5.1, True), (-5.1, True)):
+        log = read(text(series(t, *(0 * t + rolled / t[-1],) * 2, 0 * t)))
+        if straight:
+            assert with_distance(log, "", 0.25).runs[-1].name == "1"
+        else:
+            with pytest.raises(LogError, match="is not straight"):
+                with_distance(log, "", 0.25)
+
+
+def test_a_part_behind_a_gap_needs_8_rows_too() -> None:
+    t = 0.3 * np.arange(20)
+    for rows, runs in ((7, 1), (8, 2)):
+        log = read(steady(np.concatenate((t, 90 + t[:rows]))))
+        assert len(log.runs) == runs
+        log = read(steady(np.concatenate((90 + t, t[:rows]))))
+        assert len(log.runs) == runs
+
+
+def test_a_column_beside_the_needed_one_may_have_its_name_with_a_unit() -> None:
+    log = read(text([f"{line},9" for line in lines()], f"{HEADER},left_rpm"))
+    assert log.notes == ("columns not used: left_rpm",)
+
+
 def test_an_encoder_at_rest_may_rock_by_0_03_rad() -> None:
     t = np.arange(0.0, 6.0, 0.05)
     for speed, rests in ((0.07, True), (0.08, False)):
@@ -316,6 +341,7 @@ def test_all_columns_of_a_run_begin_at_its_first_row_of_the_wheels() -> None:
     assert [len(v) for v in (part.t, part.place_t, part.yaw_t, part.place, part.yaw)] == [41] * 5
     assert len(part.gyro_t) == len(part.rate) == len(run.gyro_t)  # its delay is not known yet
     assert (part.place_t[0], part.place_t[-1]) == pytest.approx((2.0, 4.0))
+    assert part.seconds == pytest.approx(2.0)
 
 
 def test_sensors_may_begin_earlier_and_end_later_than_the_wheels() -> None:

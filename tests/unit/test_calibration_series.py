@@ -75,7 +75,8 @@ SLOW = 3, 0.1, 0.0
         # if slow speeds do not jump alike: else of 60 % of the usual speed.
         (blocks((10, 2.0, 1.15)), blocks((10, 2.0, 1.3))),
         (blocks((10, 2.0, 0.5)), blocks(SLOW, (10, 2.0, 0.5))),
-        # Blocks that hardly move show nothing.
+        # Blocks that hardly move show nothing, and those that stand not even the step.
+        (blocks((3, 0.0037, 0.0), (10, 2.0, 0.5)), blocks((3, 0.0043, 0.0), (10, 2.0, 0.5))),
         (
             blocks((3, 0.1, 0.0), (4, 2.0, 0.0), (9, 0.65, 0.5)),
             blocks((3, 0.1, 0.0), (4, 2.0, 0.0), (9, 0.95, 0.5)),
@@ -111,19 +112,20 @@ def test_two_receivers_are_farther_apart_than_the_robot_drives_meanwhile() -> No
 
 def sides(
     factor: float = 0.5, jumps: int = 60, rows: int = 400, left: float = 2.0, right: float = 3.0,
-    others: int = 0, uneven: float = 0.0, rise: float = 0.0, slow: int = 0,
+    others: int = 0, otherwise: float = 0.2, uneven: float = 0.0, rise: float = 0.0, slow: int = 0,
 ) -> Floats:  # fmt: skip
     """Return two sides whose every fourth row is that of another writer, `jumps` times.
 
-    `others` of these have another factor, `uneven` is the difference of the factors of the sides,
-    speeds rise by a share around a jump, and the first `slow` jumps are at 1/20 of the speed.
+    `others` of these have a factor that is `otherwise` as large. `uneven` is the difference of the
+    factors of the sides. Speeds rise by a share around a jump, and the first `slow` jumps are at
+    1/20 of the speed.
     """
     at = 4 * np.arange(jumps) + 2
     made = np.array([np.full(rows, left), np.full(rows, right)])
     made[:, : 4 * slow] /= 20
     made[:, at + 1] *= 1 + rise
     made[:, at] *= np.array([[factor], [factor + uneven]])
-    made[:, at[:others]] *= 0.2
+    made[:, at[:others]] *= otherwise
     return made
 
 
@@ -137,6 +139,8 @@ def sides(
         (sides(right=2.5), sides(right=2.7)),  # coarse sides jump alike at one speed
         (sides(right=-2.5), sides(right=-2.7)),
         (sides(others=8), sides(others=5)),  # one factor in 90 %
+        (sides(others=8, otherwise=1.12), sides(others=8, otherwise=1.08)),
+        (sides(others=30, otherwise=3.0), sides(others=30, otherwise=4.0)),  # or its inverse
         (sides(uneven=0.06), sides(uneven=0.04)),
         (sides(rise=0.12), sides(rise=0.08)),  # the rows beside them agree
         (sides(slow=31), sides(slow=29)),
@@ -152,13 +156,13 @@ STEADY = np.repeat([2.0, 0.0, -1.0, 3.0], 100)
 
 def shares(
     low: float = 0.5, every: int = 10, of: int = 2, noise: float = 0.0, until: int = 400,
-    between: float = 0.0,
+    between: float = 0.0, at: float = 0.5,
 ) -> Floats:  # fmt: skip
     """Return a series that has a lower share of `STEADY` in one of `of` blocks of `every` rows."""
     n = np.arange(len(STEADY))
     share = np.where((n // every % of < 1) & (n < until), low, 1.0)
     share += noise * np.resize((1.0, -1.0), len(n))
-    share[(n % 100) < 100 * between] = (1 + low) / 2
+    share[(n % 100) < 100 * between] = at + (1 - at) * low
     return np.asarray(share * STEADY)
 
 
@@ -171,13 +175,18 @@ def shares(
         (shares(every=49, until=390), shares(every=49)),  # and changes 6 times
         (shares(noise=0.045), shares(noise=0.04)),  # of 8 spreads
         (shares(between=0.32), shares(between=0.28)),  # near one of them in 70 %
+        (shares(between=0.32, at=0.73), shares(between=0.32, at=0.77)),
     ],
 )
 def test_a_series_with_two_shares_of_a_steady_one_has_two_writers(one: Floats, two: Floats) -> None:
     assert in_blocks(one, STEADY) is None
-    levels = in_blocks(two, STEADY)
+    assert in_blocks(-one, STEADY) is None
+    levels, mirrored = in_blocks(two, STEADY), in_blocks(-two, STEADY)
     assert levels
-    assert levels.changes >= 6
+    assert mirrored
+    assert levels.low < levels.high
+    assert (-mirrored.high, -mirrored.low) == pytest.approx((levels.low, levels.high))
+    assert levels.changes == mirrored.changes >= 6
     assert 1.0 in (pytest.approx(levels.low, abs=0.05), pytest.approx(levels.high, abs=0.05))
 
 
@@ -190,6 +199,10 @@ def test_only_rows_count_in_which_the_other_series_is_fast_and_stays() -> None:
     for rise, two in ((0.06, False), (0.04, True)):  # 5 % from row to row
         other = 2.0 * (1 + rise) ** np.minimum(n % 20, 19 - n % 20)
         mixed = np.where((n + 5) // 10 % 2 < 1, 0.5, 1.0) * other
+        assert bool(in_blocks(mixed, other)) is two
+    for every, two in ((4, False), (3, True)):  # rows from one to the next
+        other = np.where(n % every, 0.0, 3.0)
+        mixed = np.where(n // every % 10 < 5, 0.5, 1.0) * other
         assert bool(in_blocks(mixed, other)) is two
     for fast, two in ((19, False), (20, True)):
         other = np.where(n < fast, 3.0, 0.0)
