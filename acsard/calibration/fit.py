@@ -443,14 +443,11 @@ def _judged(problem: Problem, solution: Solution, base: Base, gyro_std: float) -
     spread = math.sqrt(len(every) - 1) * float(np.std(others))
     rms = np.sqrt(squares.sum(axis=1) / np.maximum(1.0, counts.sum(axis=0)))
     errors = {s: Errors(*rms[:, k].tolist()) for k, s in enumerate(problem.sensors)}
-    turn = None
-    for s in ("gyro", "headings"):
-        if s in problem.sensors:
-            turn = _turn_errors(problem, solution)
-            break
+    turns = {"gyro", "headings"} & set(problem.sensors)
     return Fit(
         base, solution.p, solution.covariance, tuple(problem.sensors), tuple(problem.pieces),
-        solution.without, float(gain.sum()), spread, float(gain.min()), turn,
+        solution.without, float(gain.sum()), spread, float(gain.min()),
+        _turn_errors(problem, solution) if turns else None,
         errors.get("positions"), errors.get("tape"),
         bool({"positions", "tape"} & set(problem.sensors)), _tracked(problem, solution.p),
         gyro_std if _by_gyro_alone(problem) else 0.0, solution.halves,
@@ -475,7 +472,8 @@ def _tracked(problem: Problem, p: Floats) -> bool:
 def _heading_error(piece: Piece, p: Floats) -> float:
     # Return the sum of the errors of the turns between headings some seconds apart, rad.
     yaw_t, yaw = piece.run.yaw_t, piece.run.yaw
-    at = np.unique(np.searchsorted(yaw_t, np.arange(yaw_t[0], yaw_t[-1], HEADING_STEP_S)))
+    steps = max(1, round(float(yaw_t[-1] - yaw_t[0]) / HEADING_STEP_S))
+    at = np.searchsorted(yaw_t, np.linspace(yaw_t[0], yaw_t[-1], steps + 1))
     heading = piece.base.path(p, piece.left, piece.right)[1]
     off = np.diff(yaw[at] - np.interp(yaw_t[at] - p[POSE_DELAY], piece.t, heading))
     return float(np.abs(np.angle(np.exp(1j * off))).sum())
