@@ -66,7 +66,8 @@ class World(Prompt):
         self.presses = math.inf
         self.shares: list[float] = []
         self.raises: Callable[[], None] = lambda: None
-        self.session, self.where = self, SimpleNamespace(robot_id="acsar")
+        session: Any = self
+        self.session, self.where = session, SimpleNamespace(robot_id="acsar")
 
     def key(self, name: str) -> str:
         return f"acsard/acsar/{name}"
@@ -200,7 +201,7 @@ def test_poses_of_both_types_are_recorded(world: World, kind: type[Message]) -> 
 
     world.makes["pose"] = pose
     made = recorder(world)
-    made.add_poses(world.key("pose"), None)
+    made.add_poses(world.key("pose"), world.session)
     begun = world.now - 1000.0
     run = made.ride(LEG)
     assert run.place[0] == pytest.approx(begun + 2j, abs=0.1)
@@ -262,11 +263,11 @@ def test_sensors_that_are_silent_or_of_another_type_are_named(world: World) -> N
         made.add_gyro()
     assert world.now - 1000.0 == pytest.approx(FIRST_STATE_TIMEOUT_S, abs=0.1)
     with pytest.raises(LogError, match=r"a pose \(PoseStamped or Odometry\) does not arrive"):
-        made.add_poses(world.key("pose"), None)
+        made.add_poses(world.key("pose"), world.session)
     gyro(world)
     world.wait(1.0)
     with pytest.raises(LogError, match=r"key acsard/acsar/imu cannot be read \(.*; .*\): does the"):
-        made.add_poses(world.key("imu"), None)
+        made.add_poses(world.key("imu"), world.session)
     world.makes["wheel_states"] = lambda header: JointState(header, ["a"], [], [1.0])
     with pytest.raises(LogError, match=f"wheel_states has no speed of {JOINTS[0]}: if another"):
         recorder(world).ride(LEG)
