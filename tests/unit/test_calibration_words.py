@@ -147,6 +147,29 @@ class Said:
         return "\n".join(line.rstrip() for line in console.file.getvalue().splitlines())
 
 
+def test_of_many_runs_forty_show_whether_two_sensors_agree(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    run, counts = log("gyro"), list[int]()
+    found = fit([run], Config())
+    matches = {name: Match(name, 0.02, 1.5, 0.0, 0.02) for name in ("gyro", "positions")}
+    monkeypatch.setattr(results, "noise", lambda *_: QUIET)
+
+    def count(runs: Sequence[Run], config: Config, matches: Mapping[str, Match]) -> Fit:
+        counts.append(len(runs))
+        return found
+
+    monkeypatch.setattr(results, "fit", count)
+    for number, some in ((1, 1), (39, 39), (40, 20), (79, 40), (80, 27), (130, 33)):
+        runs = [run] * number
+        monkeypatch.setattr(
+            results, "examined", lambda _, drive, runs=runs: (runs, matches, list[str]())
+        )
+        counts.clear()
+        calibrate(Log(tuple(runs[:1]), ()), Config(), "a.csv")
+        assert counts == [some, some, number]
+
+
 def moved(found: Fit, left: float, right: float, track: float) -> Floats:
     return np.concatenate(([left, right, track], found.p[3:]))
 
