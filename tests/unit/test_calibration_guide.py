@@ -415,3 +415,65 @@ def test_whatever_ends_a_guided_drive_is_named(monkeypatch: pytest.MonkeyPatch) 
 def test_a_robot_that_cannot_be_guided_is_refused(text: str, words: str) -> None:
     with pytest.raises(LogError, match=words):
         Setup.of(parse(text.encode()))
+
+
+@pytest.mark.parametrize(
+    ("ratio", "words"),
+    [(0.84, "it turned 302 deg"), (0.86, ""), (2.99, ""), (3.01, "it turned 1084 deg")],
+)
+def test_a_turn_of_a_credible_track_is_one(ratio: float, words: str) -> None:
+    """The effective track is 0.85 to 3 wheel separations."""
+    t = np.linspace(0.0, 9.0, 90)
+    half = ratio * math.tau * Config().drive.wheel_separation / Config().drive.wheel_radius / 2 / 9
+    still = np.full(len(t), half)
+    run = run_of("round", {"left right": (t, -still, still)}, Notes())
+    (leg,) = (leg for leg in legs("tape", SETUP) if leg.by_key)
+    asked: list[str] = []
+
+    class Stranger(Prompt):
+        def start(self, text: str) -> None:
+            asked.append(text)
+            if len(asked) > 1:
+                raise KeyboardInterrupt
+
+        def show_text(self, text: str) -> None:
+            asked.append(text)
+
+        def instruct(self, text: str) -> None:
+            pass
+
+    with pytest.raises(KeyboardInterrupt) if words else nullcontext():
+        assert guide._repeated(leg, "", Stranger(), lambda leg: run, Config().drive) is run
+    assert words in asked[-2 if words else -1]
+
+
+@pytest.mark.parametrize(
+    ("text", "field", "value"),
+    [
+        ("", "speed", 0.3),
+        ("[limits]\nlinear_speed = 0.2\n", "speed", 0.2),
+        ("[limits]\nlinear_deceleration = 0.2\n", "speed", 0.2),  # it stops within 0.1 m
+        ("[limits]\nwheel_speed = 5.0\n", "speed", 0.225),
+        ("[limits]\nwheel_speed = 5.0\n", "rolling_speed", 0.225),  # 90 % of it
+        ("", "rolling_speed", 0.5),
+        ("", "length", 2.0),
+        ("", "reach", 0.25),
+        ("[drive]\nwheel_separation = 1.0\n", "length", 1.15),
+    ],
+)
+def test_a_guided_drive_has_the_speed_and_length_that_robot_and_floor_allow(
+    text: str, field: str, value: float
+) -> None:
+    assert getattr(Setup.of(parse(text.encode())), field) == pytest.approx(value)
+
+
+def test_the_least_limits_of_a_guided_drive() -> None:
+    for text, some in (
+        ("linear_speed = 0.051", True), ("linear_speed = 0.049", False),
+        ("angular_speed = 0.21", True), ("angular_speed = 0.19", False),
+    ):  # fmt: skip
+        with nullcontext() if some else pytest.raises(LogError, match=r"needs 0\.05 m/s and 0\.2"):
+            Setup.of(parse(f"[limits]\n{text}\n".encode()))
+    for separation, some in ((1.22, True), (1.26, False)):  # of which 0.8 m are left
+        with nullcontext() if some else pytest.raises(LogError, match="too large for a floor"):
+            Setup.of(parse(f"[drive]\nwheel_separation = {separation}\n".encode()))
