@@ -328,17 +328,18 @@ def _sides(table: _Table) -> tuple[Floats, Floats]:
             float(np.abs(np.convolve(v, kernel, "valid")).sum()) if len(v) else 0.0
             for v in (a - b, np.maximum(np.abs(a), np.abs(b)))
         )
-        if difference > MAX_SIDE_DIFFERENCE * rolled:
+        share = difference / (rolled + TINY)
+        if share > MAX_SIDE_DIFFERENCE:
             odd, alive = (front, rear) if np.abs(a).sum() < np.abs(b).sum() else (rear, front)
             low, high = (a, b) if odd == front else (b, a)
             still = np.abs(low) < STANDSTILL_SPEED
             cause = f"has it another unit or other counts than {alive}, or is it of the other side"
-            if np.abs(high[still]).sum() > difference / rolled / 2 * np.abs(high).sum():
+            if np.abs(high[still]).sum() > share / 2 * np.abs(high).sum():
                 cause = "it stands still meanwhile: is its encoder dead, or its cable loose"
             elif float(low @ high) < 0.0:
                 cause = "it turns against it: has it the wrong sign, or is it of the other side"
             raise LogError(
-                f"{odd} rolls otherwise than {alive} by {difference / rolled:.0%} of the way: {cause}? "
+                f"{odd} rolls otherwise than {alive} by {share:.0%} of the way: {cause}? "
                 "Rename the columns of the working wheels to left and right, and leave the others "
                 "out"
             )
