@@ -175,7 +175,7 @@ class Comparison:
         return np.concatenate([e[:-1] for e in edges]), np.concatenate([e[1:] for e in edges])
 
     def window(self, t: Floats) -> npt.NDArray[np.int64]:
-        return np.asarray(np.maximum(np.searchsorted(self.windows[0], t + 1e-6) - 1, 0))
+        return np.asarray(np.maximum(np.searchsorted(self.windows[0], t + TINY) - 1, 0))
 
     def rolled(self, begin: Floats, end: Floats) -> Floats:
         """Return the distances that the left and the right wheels roll, m."""

@@ -388,7 +388,7 @@ def fit(runs: Sequence[Run], config: Config, matches: dict[str, Match] | None = 
         )
     start = _start(problem, matches)
     seconds = sum(run.seconds for run in runs)
-    if problem.sensors == ["positions"] and len(runs) < PIECES and seconds < WHOLE_S:
+    if problem.sensors == ["positions"] and seconds < WHOLE_S:
         # Each piece has a free heading, which short drives cannot afford: they are fitted whole.
         whole = Problem([Piece(run, base) for run in cut(runs, 1)], bias, stds)
         solution = problem.solve(whole.solve(start).p, fixed=True)

@@ -538,6 +538,15 @@ def test_a_bias_needs_more_than_20_samples_at_rest() -> None:
         assert gyro_bias([few])[1] == (1e-3 if known else 0.05)
 
 
+def test_sides_that_differ_by_a_quarter_have_another_scale() -> None:
+    for right, other in ((1.2, False), (1.3, True), (0.82, False), (0.78, True)):
+        run = log("gyro", left=1 / RIGHT, right=right)  # without the ratio of the radii
+        found = Turns("gyro", [run], BASE).uneven()
+        assert bool(found) is other
+        if found:
+            assert found[0].ratio == pytest.approx(right, rel=0.01)
+
+
 def test_positions_fit_the_true_path_alone() -> None:
     runs = [log("positions", lever=0.1 + 0.05j, late=0.2, name=name) for name in "ab"]
     places = Places("positions", runs, BASE)
