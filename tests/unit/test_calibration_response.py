@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import cache
+
 import numpy as np
 import pytest
 from msgspec import structs
@@ -13,6 +15,11 @@ from acsard.core.config.settings import Config, DriveConfig, FeedbackConfig
 from tests.unit.calibration_logs import run, usual
 
 
+@cache
+def whole() -> Run:
+    return run(usual(), places=False)
+
+
 def commanded(lag: float, fastest: float = 99.0, cut: bool = False) -> Run:
     """Return a drive whose wheels follow steps of the command behind a lag."""
     t = np.arange(0, 60, 0.02)
@@ -21,12 +28,11 @@ def commanded(lag: float, fastest: float = 99.0, cut: bool = False) -> Run:
     for i in range(1, len(t)):
         limited = np.clip(wish[i] / 0.05, -fastest, fastest)
         speed[i] = speed[i - 1] + (limited - speed[i - 1]) * (0.02 / (lag + 0.02))
-    whole = run(usual(), places=False)
     angle = np.cumsum(speed) * 0.02
     kept = (t % 20 < 10) if cut else np.ones(len(t), dtype=bool)
     commands = np.column_stack((wish, np.zeros(len(t))))[kept]
     return structs.replace(
-        whole, t=t, left=angle, right=angle, commands_t=t[kept], commands=commands
+        whole(), t=t, left=angle, right=angle, commands_t=t[kept], commands=commands
     )
 
 
@@ -84,7 +90,7 @@ def stepped(seconds: float, lag: float = 0.4, turns: bool = False, wobble: float
         speeds[:, n] = speeds[:, n - 1] + (sides[:, n] - speeds[:, n - 1]) * 0.02 / (lag + 0.02)
     angles = np.cumsum(speeds + wobble * np.sin(44 * t), axis=1) * 0.02
     return structs.replace(
-        run(usual(), places=False), t=t, left=angles[0], right=angles[1], commands_t=t,
+        whole(), t=t, left=angles[0], right=angles[1], commands_t=t,
         commands=np.column_stack((0 * wish, wish) if turns else (wish, 0 * wish)),
     )  # fmt: skip
 
