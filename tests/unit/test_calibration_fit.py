@@ -20,6 +20,7 @@ from acsard.calibration.fit import (
     BIAS,
     GYRO_DELAY,
     POSE_DELAY,
+    SCALE,
     Errors,
     Fit,
     Piece,
@@ -29,7 +30,7 @@ from acsard.calibration.fit import (
     fit,
     moves,
 )  # fmt: skip
-from acsard.calibration.geometry import LEFT, RIGHT, TRACK, Base
+from acsard.calibration.geometry import LEFT, RIGHT, TRACK, Base, path
 from acsard.calibration.log import LogError, Notes, Run, TapeReading, run_of
 from acsard.core.config.settings import Config, DriveConfig, OdometryConfig
 from tests.unit.calibration_bags import motion
@@ -549,3 +550,33 @@ def test_only_a_gyro_and_headings_during_the_wheels_are_compared() -> None:
         late[POSE_DELAY] = 4.05  # 21 of 5 Hz are before the wheels
         off = Piece(run, Base.of(Config().drive)).residuals(late)[name]
         assert (~np.isfinite(off)).sum() == 21 * sizes
+
+
+def test_each_sensor_has_its_delay_and_a_gyro_its_scale() -> None:
+    run = sensed("gyro", "positions", lever=0.1 + 0j)
+    wrong = structs.replace(
+        run, gyro_t=run.gyro_t + 0.8, rate=1.01 * run.rate, turned=1.01 * run.turned
+    )
+    matches = {
+        "gyro": Match("gyro", 0.02, 1.5, 0.8, 0.02),
+        "positions": Match("positions", 0.02, 1.5, 0.0, 0.02, lever=(0.1, 0.0)),
+    }
+    found = fit([wrong], Config(), matches)
+    assert found.p[GYRO_DELAY] == pytest.approx(0.8, abs=0.01)
+    assert found.p[POSE_DELAY] == pytest.approx(0.0, abs=0.01)
+    assert found.p[AHEAD] == pytest.approx(0.1, abs=0.01)
+    assert found.p[SCALE] == pytest.approx(-math.log(1.01), abs=0.006)
+    assert multipliers(found) == pytest.approx([1.5, 1.0, 1.01], abs=0.006)
+
+
+def test_a_path_is_made_of_arcs() -> None:
+    half = math.pi / 2
+    place, heading = path(np.array([1.0, half, half * 2]), np.array([0.0, half, -half * 2]))
+    assert heading == pytest.approx([0.0, 0.0, half, -half])
+    assert place == pytest.approx([0, 1, 2 + 1j, 4 + 1j])
+    base = Base(0.1, 0.2, 0.5)
+    distance, turn = base.motion(np.zeros(3), np.array([3.0]), np.array([4.0]))
+    assert (distance[0], turn[0]) == pytest.approx((0.55, 1.0))
+    wider = np.array([math.log(2), math.log(0.5), math.log(4)])
+    distance, turn = base.motion(wider, np.array([3.0]), np.array([4.0]))
+    assert (distance[0], turn[0]) == pytest.approx((0.5, -0.1))

@@ -18,6 +18,7 @@ import numpy as np
 import pytest
 from msgspec import Struct, structs
 
+from acsard.calibration import noise as noises
 from acsard.calibration.fit import fit
 from acsard.calibration.geometry import LEFT, RIGHT, TRACK
 from acsard.calibration.log import Log, Run
@@ -431,8 +432,8 @@ def test_a_window_has_the_squares_of_its_errors() -> None:
 
 def test_positions_bend_by_the_turn_of_a_half_window_to_the_other() -> None:
     t = np.arange(40.0)
-    x = 0.1 * t
-    straight: Any = SimpleNamespace(at=lambda t: (0 * x, x, 0.02 * t, x, 0 * x))
+    x = 0.3 * t
+    straight: Any = SimpleNamespace(at=lambda t: (0 * x, x, 0.2 * x, x, 0 * x))
     bend = 0.05
     seen: Complexes = np.asarray(x, dtype=np.complex128)
     seen[20:] = seen[19] + (seen[20:] - seen[19]) * np.exp(1j * bend)
@@ -449,3 +450,28 @@ def test_positions_bend_by_the_turn_of_a_half_window_to_the_other() -> None:
     assert _bend(straight, t[:7], seen[:7]) is None
     standing: Any = SimpleNamespace(at=lambda t: (0 * x,) * 5)
     assert _bend(standing, t, np.zeros_like(seen)) is None
+
+
+def test_the_noise_is_compared_with_that_of_the_configuration(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    seen: list[Floats] = []
+
+    def fitted(rows: _Rows, stated: Floats) -> tuple[Floats, bool]:
+        seen.append(stated)
+        return np.zeros(5), False
+
+    monkeypatch.setattr(noises, "_fitted", fitted)
+    odometry = OdometryConfig(
+        yaw_variance_per_metre=1e-3, yaw_variance_per_radian=2e-3, distance_scale_std=0.03,
+        wheel_separation_multiplier_std=0.1, wheel_radius_ratio_std=0.02,
+        distance_variance_per_metre=5e-4,
+    )  # fmt: skip
+    found = fit([sensed("gyro")], Config())
+    shown = noise([sensed("gyro")], found, odometry)
+    # The track is 1.5 times the separation of 0.3 m, and its deviation is one of the multiplier.
+    track = 0.3 * math.exp(found.p[TRACK])
+    assert seen[0] == pytest.approx([1e-3, 2e-3, (0.1 * 0.3 / track) ** 2, (0.02 / track) ** 2, 0])
+    assert seen[1] == pytest.approx([5e-4, 0.0, 0.0, 9e-4, 0.0])
+    assert (shown.yaw_per_metre, shown.yaw_per_radian, shown.distance_per_metre) == (None,) * 3
+    assert not shown.heading_better

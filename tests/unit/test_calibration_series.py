@@ -75,6 +75,7 @@ SLOW = 3, 0.1, 0.0
         # if slow speeds do not jump alike: else of 60 % of the usual speed.
         (blocks((10, 2.0, 1.15)), blocks((10, 2.0, 1.3))),
         (blocks((10, 2.0, 0.5)), blocks(SLOW, (10, 2.0, 0.5))),
+        (blocks((1, 0.1, 0.0), (10, 2.0, 0.5)), blocks((2, 0.1, 0.0), (10, 2.0, 0.5))),
         # Blocks that hardly move show nothing, and those that stand not even the step.
         (blocks((3, 0.0037, 0.0), (10, 2.0, 0.5)), blocks((3, 0.0043, 0.0), (10, 2.0, 0.5))),
         (
