@@ -44,4 +44,7 @@ EQUIVALENT: dict[str, str] = {
     "acsard/calibration/comparison.py Comparison.judged: 'share = np.clip(off, 0.0, moved)[~bad].sum() / max(TINY, float(moved[~bad].sum()))' -> 'share = np.clip(0.0, off, moved)[~bad].sum() / max(TINY, float(moved[~bad].sum()))'": "the middle of three numbers is the same in any order",
     "acsard/calibration/fit.py Problem.__init__: \"free += [POSE_DELAY] if {'positions', 'headings'} & set(self.sensors) else []\" -> 'free += [POSE_DELAY]'": "a parameter that no sensor shows stays as it was, and only costs time",
     "acsard/calibration/fit.py Problem.__init__: \"free += [AHEAD, ASIDE] if 'positions' in self.sensors else []\" -> 'free += [AHEAD, ASIDE]'": "a parameter that no sensor shows stays as it was, and only costs time",
+    "acsard/calibration/guide.py _doubts: \"angle = math.degrees(_line_angle(found['front'], found['rear'], wheelbase))\" -> \"angle = math.degrees(_line_angle(found['rear'], found['front'], wheelbase))\"": "only the size of the angle counts",
+    "acsard/calibration/series.py by_chance: 'factor = np.where(np.abs(factor) > 1, 1 / np.where(factor, factor, 1), factor)' -> 'factor = np.where(np.abs(factor) >= 1, 1 / np.where(factor, factor, 1), factor)'": "the inverse of 1 is 1",
+    "acsard/calibration/series.py : 'CYCLE_ROWS, CYCLES, MIN_BLOCKS = (range(2, 8), 6, 3)' -> 'CYCLE_ROWS, CYCLES, MIN_BLOCKS = (range(1, 8), 6, 3)'": "a cycle of one row never differs from its mean",
 }

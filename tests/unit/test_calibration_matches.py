@@ -216,6 +216,10 @@ def test_the_unit_of_the_positions_follows_from_their_size(
     for size in (0.79, 1.26):
         text = refused(monkeypatch, Match("positions", 0.05, 1.5, 0.0, 0.05, size=size))
         assert "is t in s" in text
+        fact = f"by x, y the robot drives {size:g} times as far as by its wheels: is t in s"
+        assert text.startswith(fact)
+    text = refused(monkeypatch, Match("positions", 0.05, 4.5, 0.0, 0.05, size=1.2))
+    assert text.startswith("by the wheels the robot turns 4.5 times as far as by x, y: is t in s")
 
 
 def test_the_unit_of_a_turn_follows_from_the_track(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -332,9 +336,11 @@ def test_two_programs_that_write_the_wheels_are_named_beside_any_sensor() -> Non
 ODD = Match("gyro", 0.5, 1.5, 0.0, 0.5)
 
 
-def wheels(monkeypatch: pytest.MonkeyPatch, left: Floats, right: Floats, mixed: str = "") -> str:
+def wheels(
+    monkeypatch: pytest.MonkeyPatch, left: Floats, right: Floats, mixed: str = "", odd: Match = ODD
+) -> str:
     """Return the refusal of a log with these angles of the wheels, which a gyro contradicts."""
-    monkeypatch.setattr(hypotheses, "matched", lambda sensor, runs, base: ODD)
+    monkeypatch.setattr(hypotheses, "matched", lambda sensor, runs, base: odd)
     run = structs.replace(log("gyro"), left=left, right=right, mixed=mixed)
     with pytest.raises(LogError) as error:
         examined([run], DRIVES)
@@ -386,6 +392,18 @@ def test_sides_that_never_turn_backwards_are_named(monkeypatch: pytest.MonkeyPat
         text = wheels(monkeypatch, left, ROCKS)
         assert ("and left never turn backwards in this log" in text) is never
     assert "and left and right never turn backwards" in wheels(monkeypatch, ahead, 2.2 * ahead)
+
+
+def test_what_the_wheels_show_counts_if_a_sensor_contradicts_them_in_any_way(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    sound = GIVEN["gyro"]
+    for changes in ({"track": -1.5}, {"row": "angles"}, {"unexplained": 0.16},
+                    {"bad": ((0, 10.0, 20.0),)}):  # fmt: skip
+        odd = structs.replace(sound, **changes)
+        assert "the log has one side twice" in wheels(monkeypatch, ROCKS, ROCKS, odd=odd)
+    monkeypatch.setattr(hypotheses, "matched", lambda sensor, runs, base: sound)
+    examined([structs.replace(log("gyro"), left=ROCKS, right=ROCKS)], DRIVES)
 
 
 def test_columns_that_may_be_mixed_are_named_if_a_sensor_contradicts_them(

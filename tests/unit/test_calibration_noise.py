@@ -19,8 +19,8 @@ import pytest
 from msgspec import Struct, structs
 
 from acsard.calibration import noise as noises
-from acsard.calibration.fit import fit
-from acsard.calibration.geometry import LEFT, RIGHT, TRACK
+from acsard.calibration.fit import AHEAD, ASIDE, Piece, fit
+from acsard.calibration.geometry import LEFT, RIGHT, TRACK, Base
 from acsard.calibration.log import Log, Run
 from acsard.calibration.noise import (
     SQUARE,
@@ -475,3 +475,15 @@ def test_the_noise_is_compared_with_that_of_the_configuration(
     assert seen[1] == pytest.approx([5e-4, 0.0, 0.0, 9e-4, 0.0])
     assert (shown.yaw_per_metre, shown.yaw_per_radian, shown.distance_per_metre) == (None,) * 3
     assert not shown.heading_better
+
+
+def test_a_path_by_the_wheels_is_that_of_the_sensor() -> None:
+    piece = Piece(sensed("positions"), Base.of(DriveConfig()))
+    p = np.zeros(9)
+    p[[TRACK, AHEAD, ASIDE]] = 0.4, 0.3, -0.1
+    heading, rolled, turned, x, y = Path(piece, p).at(piece.t)
+    place, yaw = piece.base.path(p, piece.left, piece.right)
+    assert heading == pytest.approx(yaw)
+    assert x + 1j * y == pytest.approx(place + (0.3 - 0.1j) * np.exp(1j * yaw))
+    assert np.diff(rolled).min() >= 0.0
+    assert (rolled[-1], turned[-1]) == pytest.approx((7.85, 20.3), rel=0.01)
