@@ -16,10 +16,18 @@ import numpy as np
 import numpy.typing as npt
 from msgspec import Struct, field
 
+from acsard.calibration.comparison import (
+    MIN_ROLL,
+    STEP_S,
+    Match,
+    gyro_bias,
+    matched,
+    sensors,
+    weights,
+)
 from acsard.calibration.geometry import LEFT, RIGHT, TRACK, Base
-from acsard.calibration.hypotheses import HUBER, Match, gyro_bias, matched, sensors
 from acsard.calibration.log import LogError, Run
-from acsard.calibration.series import Complexes, Floats, Mask
+from acsard.calibration.series import TINY, Complexes, Floats, Mask
 from acsard.core.config.settings import Config
 
 BIAS, SCALE, GYRO_DELAY, POSE_DELAY, AHEAD, ASIDE = range(TRACK + 1, TRACK + 7)
@@ -31,10 +39,8 @@ SHARES = np.array([[-0.5, -0.5, 1.0], [-1.0, 1.0, 0.0], [0.5, 0.5, 0.0]])  # of 
 RADIUS_STD, TRACK_STD, DELAY_STD_S, LEVER_STD_M = 0.02, 1.0, 0.3, 0.2
 GYRO_STD = 0.004
 SIZE_STD = 0.05  # of both radii alike, if positions show them
-STEP_S = 1.0  # over which the turns of gyro and wheels are compared
-HEADING_STEP_S = 3.0  # the same of headings, for the report: an error is below half a turn
+HEADING_STEP_S = 3.0  # between two headings, for the report: an error is below half a turn
 GRID_S = 0.02  # of the wheels' path
-MIN_ROLL = 0.02  # rad, in a step; at rest there is nothing to compare
 HOLE_S, HOLE_PERIODS = 0.3, 8.0  # a hole in the samples of a gyro is longer than both
 
 FINEST = 1e-4  # rad or m, of any sensor
@@ -46,13 +52,15 @@ PIECES = 12  # at least
 WHOLE_S = 60.0
 MIN_RUNS = 3  # of which each is left out whole, and not a part of it, for the deviations
 FARTHEST = 3.0  # deviations of the prior, by which a piece that is left out moves a parameter
-# Halves of a log that contradict each other: sound ones differ by 1.7 deviations, or by 0.061.
-MIN_PIECES, HALVES, SURELY, MOST = 8, 0.08, 3.0, 0.6
+# Halves of a log contradict each other if they differ by more than both: those of sound ones
+# differ by 1.7 deviations, or by 0.061.
+HALVES_DEVIATIONS, HALVES_DIFFERENCE = 3.0, 0.08
+MIN_HALVED_PIECES, MAX_HALVES_DIFFERENCE = 8, 0.6
 
-SURE = 2.0  # standard deviations by which the new values must be better, or else by half
+BETTER_DEVIATIONS = 2.0  # by which the new values must be better, or else by half
 # ... or the values this far from the configured ones, by sensors: a person misreads a tape. Sound
 # robots: 5.9 and less; wrong by 1 %: 9 and more.
-FAR = 8.0
+FAR_DEVIATIONS = 8.0
 CAP = 10.0  # robust standard deviations: a residual of a run that was left out counts as at most
 AGREES = 2.0  # deviations of a reading by tape
 OTHER_TRACK, SHOWN = 0.4, 1.1  # a log that shows its track fits others worse, by this factor
@@ -121,8 +129,7 @@ def centered(values: Floats) -> Floats:
     """Return values without their robust mean, which is smooth where a median jumps."""
     off = values
     for _ in range(3):
-        size = np.abs(off)
-        weight = np.minimum(1.0, HUBER * np.median(size) / np.maximum(size, 1e-12)) + 1e-12
+        weight = weights(off, float(np.median(np.abs(off))))
         off = values - weight @ values / weight.sum()
     return off
 
@@ -152,7 +159,7 @@ def aligned(seen: Complexes, model: Complexes) -> Alignment:
         off = a * turn.conjugate() - b
         size = np.abs(off)
         middle = np.partition(size, len(size) // 2)[len(size) // 2]  # np.median is slow
-        weight = np.minimum(1.0, HUBER * middle / np.maximum(size, 1e-12))
+        weight = weights(size, float(middle))
     return Alignment(turn, weight, off)
 
 
@@ -206,14 +213,14 @@ class Problem:
                 jacobian = np.array([(m[sensor] - e) / STEP for m in moved])
                 sound = np.isfinite(e) & np.isfinite(jacobian).all(axis=0)
                 e, jacobian = e[sound], jacobian[:, sound]
-                weight = np.minimum(1.0, HUBER * sizes[sensor] / np.maximum(np.abs(e), 1e-12))
+                weight = weights(e, sizes[sensor])
                 # The threads of a matrix product cost more than they save here.
                 normal[n, k] = np.einsum("in,jn->ij", jacobian * weight, jacobian)
                 curvature[n, k] = np.einsum("in,jn->ij", jacobian * (weight == 1.0), jacobian)
                 score[n, k] = -np.einsum("in,n->i", jacobian * weight, e)
                 squares[k] += (weight * e * e).sum(), len(e)
         for k, sensor in enumerate(self.sensors):
-            inner = np.linalg.pinv(normal[:, k].sum(axis=0), rcond=1e-9, hermitian=True)
+            inner = np.linalg.pinv(normal[:, k].sum(axis=0), rcond=TINY, hermitian=True)
             apart = score[:, k] - score[:, k].mean(axis=0)
             rank = max(1, int(np.linalg.matrix_rank(inner, hermitian=True)))
             scatter = float(np.einsum("bi,ij,bj->", apart, inner, apart)) / rank
@@ -235,7 +242,7 @@ class Problem:
             off = (p - self.mean)[self.free] / scale
             step = np.linalg.solve(normal.sum(axis=0) + prior, score.sum(axis=0) - prior @ off)
             step *= min(
-                1.0, 0.3 / max(1e-12, float(np.abs(step[: TRACK + 1] * scale[: TRACK + 1]).max()))
+                1.0, 0.3 / max(TINY, float(np.abs(step[: TRACK + 1] * scale[: TRACK + 1]).max()))
             )
             p[self.free] += step * scale
             if float(np.abs(step).max()) < CONVERGED:
@@ -264,12 +271,12 @@ class Problem:
         halves = 0.0
         # Two robots, loads or floors in one log are no scatter of one, so they widen it as a whole.
         ends = np.cumsum([piece.run.seconds for piece in self.pieces])
-        if "tape" not in self.sensors and len(ends) >= MIN_PIECES:
+        if "tape" not in self.sensors and len(ends) >= MIN_HALVED_PIECES:
             first = ends <= ends[-1] / 2
             moved = (found.without(first) - found.without(~first))[GEOMETRY]
             off = np.abs(SHARES @ moved)
-            if np.any(off > np.maximum(HALVES, SURELY * deviations(made))):
-                halves = min(float(off.max()), MOST)
+            if np.any(off > np.maximum(HALVES_DIFFERENCE, HALVES_DEVIATIONS * deviations(made))):
+                halves = min(float(off.max()), MAX_HALVES_DIFFERENCE)
                 made += np.outer(moved, moved) * (halves / off.max() / 2) ** 2
         return np.asarray(made), halves
 
@@ -304,7 +311,7 @@ class Solution(Struct):
 def _robust(residuals: Sequence[Floats]) -> float:
     joined = np.concatenate(residuals)
     joined = joined[np.isfinite(joined)]
-    return 1.4826 * float(np.median(np.abs(joined))) + 1e-9 if len(joined) else 1.0
+    return 1.4826 * float(np.median(np.abs(joined))) + TINY if len(joined) else 1.0
 
 
 def cut(runs: Sequence[Run], least: int = PIECES) -> list[Run]:
@@ -352,8 +359,8 @@ class Fit(Struct, frozen=True):
     @property
     def better(self) -> bool:
         moved = self.p[GEOMETRY]
-        far = float(moved @ np.linalg.solve(self.covariance, moved)) > FAR**2
-        surely = self.gain > min(SURE * self.gain_std, math.log(2.0))
+        far = float(moved @ np.linalg.solve(self.covariance, moved)) > FAR_DEVIATIONS**2
+        surely = self.gain > min(BETTER_DEVIATIONS * self.gain_std, math.log(2.0))
         sure = surely or (far and self.readings is None)
         return sure and self.gain > 0.0 and self.worst > -WORSE
 
@@ -381,7 +388,7 @@ def fit(runs: Sequence[Run], config: Config, matches: dict[str, Match] | None = 
         )
     start = _start(problem, matches)
     seconds = sum(run.seconds for run in runs)
-    if problem.sensors == ["positions"] and len(runs) < PIECES and seconds < WHOLE_S:
+    if problem.sensors == ["positions"] and seconds < WHOLE_S:
         # Each piece has a free heading, which short drives cannot afford: they are fitted whole.
         whole = Problem([Piece(run, base) for run in cut(runs, 1)], bias, stds)
         solution = problem.solve(whole.solve(start).p, fixed=True)
@@ -397,8 +404,8 @@ def _start(problem: Problem, matches: dict[str, Match]) -> Floats:
         delay = GYRO_DELAY if sensor == "gyro" else POSE_DELAY
         p[delay] = problem.mean[delay] = match.delay
         p[AHEAD : ASIDE + 1] += match.lever
-        p[LEFT:TRACK] += math.log(abs(match.size) + 1e-9)
-        p[TRACK] = math.log(abs(match.track) + 1e-9) + p[LEFT]
+        p[LEFT:TRACK] += math.log(abs(match.size) + TINY)
+        p[TRACK] = math.log(abs(match.track) + TINY) + p[LEFT]
     turns = [
         (piece.base.motion(p, *piece.rolls)[1].sum() / reading.value)
         for piece in problem.pieces for reading in piece.run.tape
@@ -426,7 +433,7 @@ def _judged(problem: Problem, solution: Solution, base: Base, gyro_std: float) -
     least = np.array([AGREES**2 if s == "tape" else 0.0 for s in problem.sensors])
 
     def gains(kept: Mask) -> Floats:
-        floor = least * counts[kept].sum(axis=0) + 1e-18
+        floor = least * counts[kept].sum(axis=0) + TINY**2
         now, new = np.maximum(squares[:, kept].sum(axis=1), floor)
         return np.asarray(np.log(now / new) / 2)
 
@@ -436,14 +443,11 @@ def _judged(problem: Problem, solution: Solution, base: Base, gyro_std: float) -
     spread = math.sqrt(len(every) - 1) * float(np.std(others))
     rms = np.sqrt(squares.sum(axis=1) / np.maximum(1.0, counts.sum(axis=0)))
     errors = {s: Errors(*rms[:, k].tolist()) for k, s in enumerate(problem.sensors)}
-    turn = None
-    for s in ("gyro", "headings"):
-        if s in problem.sensors:
-            turn = _turn_errors(problem, solution)
-            break
+    turns = {"gyro", "headings"} & set(problem.sensors)
     return Fit(
         base, solution.p, solution.covariance, tuple(problem.sensors), tuple(problem.pieces),
-        solution.without, float(gain.sum()), spread, float(gain.min()), turn,
+        solution.without, float(gain.sum()), spread, float(gain.min()),
+        _turn_errors(problem, solution) if turns else None,
         errors.get("positions"), errors.get("tape"),
         bool({"positions", "tape"} & set(problem.sensors)), _tracked(problem, solution.p),
         gyro_std if _by_gyro_alone(problem) else 0.0, solution.halves,
@@ -468,7 +472,8 @@ def _tracked(problem: Problem, p: Floats) -> bool:
 def _heading_error(piece: Piece, p: Floats) -> float:
     # Return the sum of the errors of the turns between headings some seconds apart, rad.
     yaw_t, yaw = piece.run.yaw_t, piece.run.yaw
-    at = np.unique(np.searchsorted(yaw_t, np.arange(yaw_t[0], yaw_t[-1], HEADING_STEP_S)))
+    steps = max(1, round(float(yaw_t[-1] - yaw_t[0]) / HEADING_STEP_S))
+    at = np.searchsorted(yaw_t, np.linspace(yaw_t[0], yaw_t[-1], steps + 1))
     heading = piece.base.path(p, piece.left, piece.right)[1]
     off = np.diff(yaw[at] - np.interp(yaw_t[at] - p[POSE_DELAY], piece.t, heading))
     return float(np.abs(np.angle(np.exp(1j * off))).sum())
@@ -486,4 +491,4 @@ def _turn_errors(problem: Problem, solution: Solution) -> Errors:
                 off[k] += float(np.nansum(np.abs(piece.residuals(p)["gyro"])))
             elif len(piece.run.yaw_t) > 1:
                 off[k] += _heading_error(piece, p)
-    return Errors(*(off * math.tau / max(turned, 1e-9)).tolist())
+    return Errors(*(off * math.tau / max(turned, TINY)).tolist())

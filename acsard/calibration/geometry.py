@@ -12,6 +12,7 @@ from acsard.core.config.settings import DriveConfig
 from acsard.core.values import Metres
 
 LEFT, RIGHT, TRACK = range(3)  # of the parameters
+CONFIGURED = np.zeros(TRACK + 1)  # parameters
 
 
 class Base(Struct, frozen=True):

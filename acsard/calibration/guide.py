@@ -210,8 +210,8 @@ def _doubts(
     run: Run, found: dict[str, Metres], wheelbase: Metres, drive: DriveConfig
 ) -> Iterator[str]:
     # Answers that are possible, but more likely misread.
-    mm, rolled = found.get("distance", 0.0) * 1000, run.left[-1] - run.left[0]
-    wheels = 500 * drive.wheel_radius * abs(float(rolled + run.right[-1] - run.right[0]))
+    mm = found.get("distance", 0.0) * 1000
+    wheels = 500 * drive.wheel_radius * abs(float(run.left[-1] + run.right[-1]))
     if mm >= MIN_TAPE_M * 1000 and abs(mm - wheels) > ODD_SHARE * wheels:
         yield f"you measured {mm:.0f} mm, but by its wheels the robot drove {wheels:.0f} mm"
     if "front" in found:

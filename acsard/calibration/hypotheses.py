@@ -1,69 +1,50 @@
-"""Compares each sensor alone with the wheels, and names the mistake that explains a contradiction.
+"""Names the mistake that explains why the sensors of a log contradict its wheels.
 
-A fit that is better than a wrong configuration is not right. So each sensor of every log is
-compared with the wheels as they are, with another scale or sign of one side, and with the turns to
-the other side, on one grid of delays (and of tracks, for positions). The comparison also shows the
-size of the wheels, so wrong units and counts show as a robot that cannot be. A cause is named if it
-leads to a possible robot.
+A fit that is better than a wrong configuration is not right, so each sensor of every log is first
+compared with the wheels (`comparison.py`). The comparison also shows the size of the wheels, so
+wrong units and counts show as a robot that cannot be. A cause is named if it leads to a possible
+robot.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from itertools import pairwise
+from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
-import numpy.typing as npt
-from msgspec import Struct
 from msgspec.structs import replace
 
-from acsard.calibration.geometry import Base, path
+from acsard.calibration.comparison import (
+    LATE_S,
+    ROBOTS,
+    STEP_S,
+    WIDE_DELAYS_S,
+    Match,
+    Span,
+    gyro_bias,
+    matched,
+    sensors,
+    without,
+)
+from acsard.calibration.geometry import Base
 from acsard.calibration.log import MIXED, LogError, Run
-from acsard.calibration.series import Complexes, Floats, Mask, in_blocks
+from acsard.calibration.series import TINY, in_blocks
 from acsard.core.config.settings import DriveConfig
 from acsard.core.values import Seconds
 
-STEP_S, WINDOW_S, GRID_S = 1.0, 10.0, 0.05  # of turns, of positions, and of the wheels' path
-MIN_SPOTS, MAX_SPOTS = 10, 2000  # positions of a window, and of a log
-SEARCH_S = 200.0  # of the parts that are searched
-APART_S = 60.0  # between two runs on their common axis of time
-MIN_ROLL, LEAST_TURN = 0.02, 1e-3  # rad, in a step that shows something
-HUBER = 1.5  # robust standard deviations, beyond which a position counts less
-BIAS_STD, REST_BIAS_STD, MIN_RESTS = 0.05, 1e-3, 20  # rad/s, of a gyro without and with rests
-CAP = 0.5  # rad, beyond which a turn counts as not explained
-HOLE_S, HOLE_PERIODS = 0.5, 8.0  # a hole in the samples of a sensor is longer than both
-LEVER = 1e-3  # weight of the lever of a sensor, which is small
-
-TRACKS, WIDE_TRACKS = (np.geomspace(*span, 66) for span in ((0.3, 4.0), (0.01, 1000.0)))
-FINE = np.linspace(0.95, 1.05, 21)  # of the best track
-DELAYS_S, WIDE_DELAYS_S = np.linspace(-1.0, 1.0, 21), np.linspace(-8.0, 8.0, 65)
-DELAY_COST = 1e-3  # for each second: of equal delays, the least one counts
-LATE_S, NOTED_LATE_S = 0.9, 0.1
-RATIOS = -1.0, 2.0, 0.5, 4.0, 0.25  # of the left side, that positions are compared with
-ROUNDS = 12  # of the weights of the least absolute values
-
-FOLLOWS = 0.3  # share of a sensor's motion that the wheels need not explain
+NOTED_LATE_S = 0.1
 POOR, POORER = 0.15, 3.0  # share, and in that of the best sensor, of one that is left out
-# A row that is not the given one with a possible robot must leave less than half unexplained.
-CLEARER, CLEAR = 2.0, 0.02
-ROBOTS, USUAL_ROBOTS = (0.8, 3.6), (0.8, 2.8)  # effective track / wheel separation
-SIZES, SAME_SIZE = (0.8, 1.25), (0.8, 1.25)  # distance by positions / by the wheels
+USUAL_ROBOTS = 0.8, 2.8  # effective track / wheel separation, if a cause explains it
+SIZES = 0.8, 1.25  # distance by positions / by the wheels
 SAME_SIGN = 0.25  # of a ratio of -1
 
-BAD, BAD_TURN, BAD_WAY_M, MAX_BAD = 0.9, 0.15, 0.1, 0.4  # of a window that is left out
 MARGIN_S = 5.0  # beside a window that is left out
 LEAST_S, LEAST_PART_S = 30.0, 2.0  # of a log of which a part is left out, and of its parts
 STILL, ALONE = 1e-3, 0.2  # of a side that stands, rad in a step, and what the other rolls meanwhile
 TWICE, BACKWARDS = 0.02, 1e-3  # share of the rolled angle; rad in a row
-UNLIKE = 20.0  # ways of one side / of the other, that no robot drives
-OVERFLOWS, USUAL = 3.0, 0.9  # of this quantile of the steps of a running count
+MAX_SIDE_RATIO = 20.0  # ways of one side / of the other
 
 NAMES = {"gyro": "yaw_rate", "headings": "yaw", "positions": "x, y"}
-COLUMNS = {
-    "gyro": ("gyro_t", "turned", "rate"), "headings": ("yaw_t", "yaw"),
-    "positions": ("place_t", "place"),
-}  # fmt: skip
 UNITS = "the speeds of the wheels are in {}, not in rad/s"
 COUNTS = "the speeds of the wheels are {} the true ones: correct the counts of a wheel turn"
 SPEEDS = {
@@ -88,57 +69,6 @@ MIRRORED = {
     "gyro": "yaw_rate must grow to the left", "headings": "yaw must grow to the left",
     "positions": "x, y are mirrored: y must point to the left of x",
 }  # fmt: skip
-
-
-def _unwrapped(integral: Floats, t: Floats) -> Floats:
-    steps = np.diff(np.gradient(integral, t), prepend=0.0)
-    wild = np.abs(steps) > OVERFLOWS * np.quantile(np.abs(steps), USUAL)
-    return np.asarray(np.cumsum(np.where(wild, 0.0, steps)))
-
-
-# Other meanings of the columns. If they are angles, the angle is what was integrated.
-ROWS: dict[str, Callable[[Run], Run]] = {
-    "angles": lambda run: replace(
-        run, left=_unwrapped(run.left, run.t), right=_unwrapped(run.right, run.t)
-    ),
-    "degrees": lambda run: replace(run, yaw=np.radians(run.yaw)),
-}
-
-Span = tuple[int, Seconds, Seconds]  # a part of a log: index of the run, begin and end
-
-
-class Match(Struct, frozen=True):
-    """What a sensor shows of the wheels, if one row of the table is right."""
-
-    sensor: str
-    unexplained: float  # share of the sensor's motion, without the bad windows
-    track: float  # turn by the wheels / by the sensor, as configured; negative to the other side
-    delay: Seconds
-    raw: float  # unexplained share with the bad windows, and with turns that only the wheels show
-    ratio: float = 1.0  # by which left must be multiplied beside right
-    size: float = 1.0  # distance by positions / by the wheels, as configured
-    lever: tuple[float, float] = (0.0, 0.0)  # of the sensor, ahead and to the left, m
-    bad: tuple[Span, ...] = ()
-    row: str = ""  # a key of ROWS
-    as_given: float = 0.0  # unexplained share by the given row, with turns to the given side
-
-    @property
-    def follows(self) -> bool:
-        return self.unexplained < FOLLOWS
-
-    @property
-    def given(self) -> bool:
-        return not self.row and self.ratio == 1.0 and self.track > 0
-
-    @property
-    def cost(self) -> float:
-        return float(cost(self.raw, self.track if self.given else 0.0, self.delay))
-
-
-def cost(share: float | Floats, track: float | Floats, delay: float | Floats) -> Floats:
-    """Return by how much a row explains less than others. A possible robot has a head start."""
-    possible = (np.asarray(track) > ROBOTS[0]) & (np.asarray(track) < ROBOTS[1])
-    return np.where(possible, share, CLEARER * share + CLEAR) + DELAY_COST * np.abs(delay)
 
 
 def examined(
@@ -186,61 +116,52 @@ def examined(
             runs = [without(run, sensor) for run in runs]
         if sensor in following and abs(match.delay) > NOTED_LATE_S:
             notes.append(f"the times of {name} are {1000 * match.delay:.0f} ms after the wheels'")
-    kept, more = _without_spans(runs, sorted({span for m in following.values() for span in m.bad}))
+    kept, more = _without_spans(runs, {span for m in following.values() for span in m.bad})
     if more:
         following = {sensor: matched(sensor, kept, base) for sensor in following}
     return kept, following, [*notes, *more]
 
 
-def sensors(runs: Sequence[Run]) -> list[str]:
-    return [s for s, (t, *_) in COLUMNS.items() if any(len(getattr(run, t)) > 2 for run in runs)]
-
-
-def without(run: Run, *left_out: str) -> Run:
-    """Return the run without these sensors."""
-    empty = {name: getattr(run, name)[:0] for sensor in left_out for name in COLUMNS[sensor]}
-    return replace(run, **empty)
-
-
-def gyro_bias(runs: Sequence[Run]) -> tuple[float, float]:
-    """Return the rate that the gyro shows while the wheels rest, and its deviation, rad/s."""
-    rest = np.concatenate([run.rate[run.rests(run.gyro_t)] for run in runs])
-    known = len(rest) > MIN_RESTS
-    return (float(np.median(rest)), REST_BIAS_STD) if known else (0.0, BIAS_STD)
-
-
 def _alternates(runs: Sequence[Run], base: Base) -> tuple[str, str]:
-    # What a gyro that is now this, now that share of the wheels' turn shows: two sensors in blocks.
-    # And the same of the wheels.
+    # What shows two IMUs, and what two programs that write the wheels, in blocks.
     found = [(np.zeros(0), np.zeros(0))]
     for run in runs:
         left, right = (np.gradient(side, run.t) for side in (run.left, run.right))
         turn = np.interp(run.gyro_t, run.t, base.right * right - base.left * left) / base.track
         found.append((turn, run.rate))
     turn, rate = (np.concatenate(columns) for columns in zip(*found, strict=True))
-    return in_blocks("yaw_rate", rate, "the turn rate of the wheels", turn), in_blocks(
-        "the turn rate of the wheels", turn, "yaw_rate", rate - gyro_bias(runs)[0]
-    )
+    wheels = "the turn rate of the wheels"
+    facts = []
+    for name, values, other_name, other, writers in (
+        ("yaw_rate", rate, wheels, turn, "two IMUs on one topic"),
+        (wheels, turn, "yaw_rate", rate - gyro_bias(runs)[0],
+         "two programs, like a joint_state_publisher beside the driver,"),
+    ):  # fmt: skip
+        levels = in_blocks(values, other)
+        facts.append(
+            f"{name} is now {levels.low:.2f}, now {levels.high:.2f} times {other_name}, and "
+            f"changes {levels.changes} times while that stays, as if {writers} wrote it by turns"
+            if levels else ""
+        )  # fmt: skip
+    return facts[0], facts[1]
 
 
-def _without_spans(runs: Sequence[Run], spans: Sequence[Span]) -> tuple[list[Run], list[str]]:
+def _without_spans(runs: Sequence[Run], spans: set[Span]) -> tuple[list[Run], list[str]]:
     made, parts = list[Run](), list[str]()
     for n, run in enumerate(runs):
-        own = sorted((max(run.t[0], begin - MARGIN_S), min(run.t[-1], end + MARGIN_S))
-                     for index, begin, end in spans if index == n)  # fmt: skip
-        if not own:
+        bad = _joined([
+            (max(run.t[0], begin - MARGIN_S), min(run.t[-1], end + MARGIN_S))
+            for index, begin, end in spans if index == n
+        ])  # fmt: skip
+        if not bad:
             made.append(run)
             continue
-        apart = [at for at, (span, last) in enumerate(pairwise(own), 1) if last[0] > span[1]]
-        own = [(part[0][0], part[-1][1])
-               for part in (own[a:b] for a, b in pairwise((0, *apart, len(own))))]  # fmt: skip
-        parts += [f"{begin:.0f} to {end:.0f} s of run {run.name}" for begin, end in own]
-        edges, first = (run.t[0], *(t for span in own for t in span), run.t[-1]), len(made)
-        made += [run.part(begin, end) for begin, end in zip(edges[::2], edges[1::2], strict=True)
-                 if end - begin > LEAST_PART_S]  # fmt: skip
-        made[first + 1 :] = [
-            replace(part, name=f"{part.name}.{k}") for k, part in enumerate(made[first + 1 :], 2)
-        ]
+        parts += [f"{begin:.0f} to {end:.0f} s of run {run.name}" for begin, end in bad]
+        begins, ends = zip((run.t[0], run.t[0]), *bad, (run.t[-1], run.t[-1]), strict=True)
+        kept = [run.part(begin, end) for begin, end in zip(ends[:-1], begins[1:], strict=True)
+                if end - begin > LEAST_PART_S]  # fmt: skip
+        made += [replace(part, name=f"{run.name}.{k}" if k > 1 else run.name)
+                 for k, part in enumerate(kept, 1)]  # fmt: skip
     words = f"the sensors contradict the wheels there: {', '.join(parts)}"
     left = sum(run.seconds for run in made)
     if parts and left < LEAST_S:
@@ -248,21 +169,14 @@ def _without_spans(runs: Sequence[Run], spans: Sequence[Span]) -> tuple[list[Run
     return made, [f"left out, because {words}"] if parts else []
 
 
-def matched(sensor: str, runs: Sequence[Run], base: Base) -> Match:
-    """Return the row of the table that fits a sensor: the given one, unless another is clearer."""
-    kind = Places if sensor == "positions" else Turns
-    seen = kind(sensor, runs, base)
-    found = [seen.match()]
-    if found[0].cost > CLEAR:
-        found += seen.uneven()
-    best = min(found, key=lambda match: match.cost)
-    if not (best.follows and abs(best.delay) < LATE_S):
-        found.append(seen.match(wide=True))
-        for row in ("angles", *["degrees"] * (sensor == "headings")):
-            match = kind(sensor, list(map(ROWS[row], runs)), base).match(wide=True)
-            found.append(replace(match, row=row))
-        best = min(found, key=lambda match: match.cost)
-    return replace(best if best.follows else found[0], as_given=found[0].as_given)
+def _joined(spans: Sequence[tuple[Seconds, Seconds]]) -> list[tuple[Seconds, Seconds]]:
+    made = list[tuple[Seconds, Seconds]]()
+    for begin, end in sorted(spans):
+        if made and begin <= made[-1][1]:
+            made[-1] = made[-1][0], max(end, made[-1][1])
+        else:
+            made.append((begin, end))
+    return made
 
 
 def _facts(runs: Sequence[Run], matches: Mapping[str, Match]) -> Iterator[str]:
@@ -286,7 +200,7 @@ def _facts(runs: Sequence[Run], matches: Mapping[str, Match]) -> Iterator[str]:
                 "its cable loose?"
             )
     less, more = sorted(("left", "right"), key=lambda side: _rolled(runs, side))
-    if (ratio := _rolled(runs, more) / (_rolled(runs, less) + 1e-9)) > UNLIKE:
+    if (ratio := _rolled(runs, more) / (_rolled(runs, less) + TINY)) > MAX_SIDE_RATIO:
         yield (
             f"{more} rolls {ratio:.0f} times as far as {less}, against {names}: is {more} a "
             "running count, or in another unit? Write both as speeds in rad/s"
@@ -366,19 +280,19 @@ def _sized(matches: Mapping[str, Match], drive: DriveConfig, other: str) -> Iter
     ]  # fmt: skip
 
     def possible(
-        tracks: tuple[float, float], sizes: tuple[float, float], *, speeds: float = 1.0,
-        places: float = 1.0, turns: Mapping[str, float] = {}, alias: bool = False,
+        robots: tuple[float, float] = USUAL_ROBOTS, *, speeds: float = 1.0, places: float = 1.0,
+        turns: Mapping[str, float] = {}, alias: bool = False,
     ) -> bool:  # fmt: skip
         return all(
             (alias and sensor == "positions")
-            or tracks[0] < track / speeds * turns.get(sensor, 1.0) < tracks[1]
+            or robots[0] < track / speeds * turns.get(sensor, 1.0) < robots[1]
             for sensor, track, _ in seen
         ) and all(
-            sensor != "positions" or sizes[0] < size * speeds / places < sizes[1]
+            sensor != "positions" or SIZES[0] < size * speeds / places < SIZES[1]
             for sensor, _, size in seen
         )
 
-    if possible(ROBOTS, SIZES):
+    if possible(ROBOTS):
         return
     facts = [f"by the wheels the robot turns {track:.3g} times as far as by {NAMES[sensor]}"
              for sensor, track, _ in seen if not ROBOTS[0] < track < ROBOTS[1]]  # fmt: skip
@@ -388,15 +302,12 @@ def _sized(matches: Mapping[str, Match], drive: DriveConfig, other: str) -> Iter
         drive.wheel_radius * factor: UNITS.format(f"{unit} at the rim")
         for factor, unit in ((1.0, "m/s"), (1000.0, "mm/s"))
     }
-    check = USUAL_ROBOTS, SAME_SIZE
-    causes = [words for k, words in speeds.items() if possible(*check, speeds=k)]
-    causes += dict.fromkeys(words for k, words in PLACES.items() if possible(*check, places=k))
+    causes = [words for k, words in speeds.items() if possible(speeds=k)]
+    causes += dict.fromkeys(words for k, words in PLACES.items() if possible(places=k))
     causes += [f"{NAMES[sensor]} is in deg, not in rad" for sensor, _, _ in seen
-               if possible(*check, turns={sensor: 180 / math.pi})]  # fmt: skip
+               if possible(turns={sensor: 180 / math.pi})]  # fmt: skip
     # Turns of 90 deg on the spot show no track by positions, but their size is right.
-    causes = causes or [
-        words for k, words in speeds.items() if possible(*check, speeds=k, alias=True)
-    ]
+    causes = causes or [words for k, words in speeds.items() if possible(speeds=k, alias=True)]
     yield f"{' and '.join(facts)}: " + (
         ", or ".join(causes)
         or other
@@ -412,220 +323,3 @@ def _late(matches: Mapping[str, Match]) -> Iterator[str]:
                 f"the times of {NAMES[sensor]} are {match.delay:.1f} s after those of the wheels: "
                 "record all sensors with times from the same clock"
             )
-
-
-class Comparison:
-    """One sensor beside the wheels: all runs on one axis of time, in steps and in windows."""
-
-    def __init__(self, sensor: str, runs: Sequence[Run], base: Base) -> None:
-        self.sensor, self.base = sensor, base
-        self.shift = np.cumsum([0.0, *(run.t[-1] + APART_S for run in runs[:-1])])
-        made: dict[str, Floats | Complexes] = {
-            name: np.concatenate(
-                [getattr(run, name) + at for run, at in zip(runs, self.shift, strict=True)]
-            )
-            for name in ("t", "gyro_t", "place_t", "yaw_t")
-        }
-        for name in ("left", "right", "turned"):
-            parts, last = [np.zeros(0)], 0.0
-            for values in [getattr(run, name) for run in runs if len(getattr(run, name))]:
-                parts.append(values - values[0] + last)
-                last = float(parts[-1][-1])
-            made[name] = np.concatenate(parts)
-        made |= {n: np.concatenate([getattr(r, n) for r in runs]) for n in ("place", "yaw")}
-        self.run = replace(runs[0], **made)
-        # Few positions fit any wheels, because each window is turned and moved.
-        steps = np.diff(self.run.place_t)
-        self.window_s = max(WINDOW_S, MIN_SPOTS * float(np.median(steps)) if len(steps) else 0.0)
-        self.begin, self.end = self._edges(runs, STEP_S)
-        self.windows = self._edges(runs, self.window_s)
-
-    def _edges(self, runs: Sequence[Run], step: Seconds) -> tuple[Floats, Floats]:
-        edges = [run.edges(step) + shift for run, shift in zip(runs, self.shift, strict=True)]
-        return np.concatenate([e[:-1] for e in edges]), np.concatenate([e[1:] for e in edges])
-
-    def window(self, t: Floats) -> npt.NDArray[np.int64]:
-        return np.asarray(np.maximum(np.searchsorted(self.windows[0], t + 1e-6) - 1, 0))
-
-    def rolled(self, begin: Floats, end: Floats) -> Floats:
-        """Return the distances that the left and the right wheels roll, m."""
-        return np.array([
-            radius * (np.interp(end, self.run.t, side) - np.interp(begin, self.run.t, side))
-            for radius, side in ((self.base.left, self.run.left), (self.base.right, self.run.right))
-        ])  # fmt: skip
-
-    def rolls(self, begin: Floats, end: Floats) -> Mask:
-        rolled = np.abs(self.rolled(begin, end)).sum(axis=0)
-        return np.asarray(rolled > MIN_ROLL * self.base.left)
-
-    def judged(
-        self, t: Floats, off: Floats, moved: Floats, rolls: Mask, least: float
-    ) -> tuple[float, tuple[Span, ...]]:
-        """Return the unexplained share of the motion without the bad windows, and these."""
-        window, known = self.window(t), np.isfinite(off + moved)
-
-        def sums(values: Floats, mask: Mask) -> Floats:
-            counted = np.bincount(window[mask], values[mask], minlength=len(self.windows[0]))
-            return np.asarray(counted, dtype=np.float64)
-
-        bad = sums(off - least, known) > 0
-        bad &= sums(off - BAD * moved, known) > 0
-        off, moved = (sums(values, known & rolls) for values in (off, moved))
-        if bad.sum() > MAX_BAD * (bad | (moved > 0)).sum():
-            bad[:] = False
-        share = np.clip(off, 0.0, moved)[~bad].sum() / max(1e-9, float(moved[~bad].sum()))
-        run = np.searchsorted(self.shift, self.windows[0], side="right") - 1
-        begin, end = (edge - self.shift[run] for edge in self.windows)
-        spans = zip(run[bad].tolist(), begin[bad].tolist(), end[bad].tolist(), strict=True)
-        return float(share), tuple(spans)
-
-
-class Turns(Comparison):
-    """The turns by a gyro or by headings, in steps."""
-
-    def __init__(self, sensor: str, runs: Sequence[Run], base: Base) -> None:
-        super().__init__(sensor, runs, base)
-        self.t, self.values = self.run.yaw_t, np.unwrap(self.run.yaw)
-        if sensor == "gyro":
-            self.t, self.values = self.run.gyro_t, self.run.turned
-        steps = np.diff(self.t)
-        holes = steps > max(HOLE_S, HOLE_PERIODS * float(np.median(steps)))
-        self.holes = np.concatenate(([0], np.cumsum(holes)))
-        self.moving = self.rolls(self.begin, self.end)
-
-    def seen(self, delay: Seconds) -> Floats:
-        begin, end = self.begin + delay, self.end + delay
-        first = np.searchsorted(self.t, begin, side="right") - 1
-        last = np.searchsorted(self.t, end)
-        inside = (first >= 0) & (last < len(self.t))
-        first, last = np.maximum(first, 0), np.minimum(last, len(self.t) - 1)
-        turned = np.interp(end, self.t, self.values) - np.interp(begin, self.t, self.values)
-        return np.where(inside & (self.holes[first] == self.holes[last]), turned, np.nan)
-
-    def match(self, *, even: bool = True, wide: bool = False) -> Match:
-        """Return the least absolute values of the turns beside those by the wheels.
-
-        A gyro has a bias, too. Both sides count alike if they are `even`.
-        """
-        left, right = self.rolled(self.begin, self.end) / self.base.track
-        bias = (self.sensor == "gyro") * (self.end - self.begin)
-        columns = np.array([right - left, bias] if even else [right, -left, bias])
-        delays = np.append(DELAYS_S, WIDE_DELAYS_S) if wide else DELAYS_S
-        seen = np.array([self.seen(delay) for delay in delays])
-        known = np.isfinite(seen)
-        y, weight = np.where(known, seen, 0.0), known.astype(float)
-        ridge = np.diag([*[1e-9] * (len(columns) - 1), 1e-3])
-        for _ in range(ROUNDS):
-            normal = np.einsum("dn,in,jn->dij", weight, columns, columns)
-            normal += ridge * (1 + weight.sum(axis=1))[:, None, None]
-            score = np.einsum("dn,in,dn->di", weight, columns, y)
-            shares = np.linalg.solve(normal, score[:, :, None])[:, :, 0]
-            off = np.abs(y - shares @ columns)
-            weight = known / np.maximum(off, LEAST_TURN)
-        mean = shares[:, :-1].mean(axis=1)
-        tracks = 1 / np.where(np.abs(mean) > 1e-6, mean, 1e-6)
-        moved = np.abs(y - shares[:, -1:] * bias)
-        used = known & self.moving
-        off, most = (np.minimum(values, CAP) * used for values in (off, moved))
-        share = np.minimum(off.sum(axis=1) / (most.sum(axis=1) + 1e-9), 1.0)
-        # A step that the delay loses is not explained.
-        share = 1 - (1 - share) * used.sum(axis=1) / max(1, int(self.moving.sum()))
-        at = int(np.argmin(cost(share, tracks, delays)))
-        track, delay, raw = (float(values[at]) for values in (tracks, delays, share))
-        wheels = np.where(self.moving, columns[:-1].T @ shares[at, :-1], 0.0)
-        off = np.abs(y[at] - shares[at, -1] * bias - wheels)
-        off = np.where(known[at], off, np.minimum(moved[at], BAD_TURN))
-        judged, bad = self.judged(self.begin, off, moved[at], self.moving, BAD_TURN)
-        ratio = 1.0 if even else float(shares[at, 1] / (shares[at, 0] or 1e-9))
-        as_given = judged if track > 0.0 else 1.0
-        return Match(
-            self.sensor, judged, track, delay, raw, ratio, bad=bad, as_given=as_given
-        )  # fmt: skip
-
-    def uneven(self) -> list[Match]:
-        found = self.match(even=False)
-        return [] if SAME_SIZE[0] < found.ratio < SAME_SIZE[1] else [found]
-
-
-class Places(Comparison):
-    """Positions, in windows of which each is turned and moved onto the path of the wheels."""
-
-    def __init__(self, sensor: str, runs: Sequence[Run], base: Base) -> None:
-        super().__init__(sensor, runs, base)
-        every = max(1, len(self.run.place_t) // MAX_SPOTS)
-        self.t, self.place = self.run.place_t[::every], self.run.place[::every]
-        window = self.window(self.t)
-        self.first = np.flatnonzero(np.diff(window, prepend=-1))
-        self.part = np.cumsum(np.diff(window, prepend=-1) != 0) - 1
-        edges = [run.edges(GRID_S) + shift for run, shift in zip(runs, self.shift, strict=True)]
-        self.grid = np.concatenate(edges)
-        between = self.run.place[1:-1] - (self.run.place[2:] + self.run.place[:-2]) / 2
-        self.noise = float(np.median(np.abs(between))) / math.sqrt(1.5)
-        self.rolling = self.rolled(self.grid[:-1], self.grid[1:])
-        # A part of a long log suffices for the search.
-        every = int(sum(run.seconds for run in runs) / SEARCH_S)
-        parts = [run.part(a, a + self.window_s) for run in runs
-                 for a in np.arange(run.t[0], run.t[-1] - STEP_S, self.window_s)]  # fmt: skip
-        self.few = Places(sensor, parts[::every], base) if 1 < every < len(parts) / 3 else self
-
-    def fitted(self, ratio: float, track: float, delay: Seconds) -> tuple[float, Floats, Floats]:
-        """Return the unexplained share, size of the wheels and lever, and each error, m."""
-        a, b = self.rolling * [[ratio], [1.0]]
-        place, heading = path((a + b) / 2, (b - a) / (self.base.track * track))
-        at = self.t - delay
-        model = np.interp(at, self.grid, place.real) + 1j * np.interp(at, self.grid, place.imag)
-        lever = np.exp(1j * np.interp(at, self.grid, heading))
-        weight, turned = np.ones(len(at)), model
-        for _ in range(3):
-            seen, m, e, turned = (
-                v - (np.add.reduceat(weight * v, self.first)
-                     / np.add.reduceat(weight, self.first))[self.part]
-                for v in (self.place, model, lever, turned)
-            )  # fmt: skip
-            turn = np.add.reduceat(weight * seen * turned.conj(), self.first)
-            turn = np.where(np.abs(turn) > 1e-9, turn, 1.0)  # of wheels that stand
-            back = seen * (turn / np.abs(turn)).conj()[self.part]
-            columns = np.array([m, e, 1j * e])
-            # The threads of a matrix product cost more than they save here.
-            normal = np.einsum("in,n,jn->ij", columns.conj(), weight, columns).real
-            normal += np.diag([1e-9, LEVER * len(at), LEVER * len(at)])
-            score = np.einsum("in,n,n->i", columns.conj(), weight, back).real
-            x = np.linalg.solve(normal, score)
-            turned = x[0] * m + (x[1] + 1j * x[2]) * e
-            off = np.abs(back - turned)
-            weight = np.minimum(1.0, (HUBER * np.median(off) + 1e-9) / (off + 1e-12))
-        wrong, moved = (np.add.reduceat(v, self.first) for v in (off, np.abs(seen)))
-        return float(np.minimum(wrong, moved).sum() / max(1e-9, moved.sum())), x, off
-
-    def match(self, ratio: float = 1.0, *, wide: bool = False) -> Match:
-        few = self.few
-
-        def best(tracks: Floats, delays: Floats) -> tuple[float, float, float]:
-            return min(
-                (float(cost(few.fitted(ratio, track, delay)[0], track, delay)), track, delay)
-                for track in tracks.tolist() for delay in delays.tolist()
-            )  # fmt: skip
-
-        tracks = np.outer((1.0, -1.0), WIDE_TRACKS if wide else TRACKS).ravel()
-        found = best(tracks, np.zeros(1))
-        if wide:
-            found = min(found, best(np.outer((1.0, -1.0), TRACKS[::3]).ravel(), WIDE_DELAYS_S))
-        _, track, delay = found
-        _, _, delay = best(np.array([track]), delay + DELAYS_S)
-        _, track, _ = best(np.append(tracks, track * FINE), np.array([delay]))
-        raw, (size, ahead, aside), off = self.fitted(ratio, track, delay)
-        moved = np.abs(self.place - (np.add.reduceat(self.place, self.first)
-                                     / np.bincount(self.part))[self.part])  # fmt: skip
-        rolls = self.rolls(self.t - STEP_S / 2, self.t + STEP_S / 2)
-        share, bad = self.judged(self.t, off - self.noise, moved, rolls, BAD_WAY_M)
-        if not tracks.min() < track < tracks.max():
-            share = max(share, FOLLOWS)  # the best track is none of a robot
-        lever = float(ahead), float(aside)
-        as_given = share if track > 0.0 else self.fitted(ratio, -track, delay)[0]
-        return Match(
-            self.sensor, share, track, delay, raw, ratio, float(size), lever, bad,
-            as_given=as_given,
-        )  # fmt: skip
-
-    def uneven(self) -> list[Match]:
-        return [self.match(ratio) for ratio in RATIOS]

@@ -17,8 +17,7 @@ import numpy as np
 import zenoh
 
 from acsard.bus.subscription import Subscription, encoded
-from acsard.calibration.fit import ASIDE
-from acsard.calibration.geometry import Base
+from acsard.calibration.geometry import CONFIGURED, Base
 from acsard.calibration.log import APPLIED, LogError, Notes, Run, run_of
 from acsard.calibration.plan import Leg, Move
 from acsard.calibration.series import Floats
@@ -138,7 +137,7 @@ def require_path(
     table = np.array(rows)
     steps = np.diff(table[:, 0])[:, None]
     rolled = ((table[1:, 2:] + table[:-1, 2:]) / 2 * steps).sum(axis=0)
-    made = base.motion(np.zeros(ASIDE + 1), *rolled)
+    made = base.motion(CONFIGURED, *rolled)
     least, most = (move.seconds,) * 2 if driven is None else (max(0.0, driven - LAG_S), driven)
     commanded = move.linear, move.angular
     for seen, speed, off, unit in zip(made, commanded, OFF, ("m", "rad"), strict=True):
@@ -188,10 +187,10 @@ class Recorder:
         sensor.await_first("a gyro's turn rate")
         self._others.append(sensor)
 
-    def add_poses(self, key: str, session: zenoh.Session | None) -> None:
-        """Record the poses on a full key of this session, too, or of the client's."""
+    def add_poses(self, key: str, session: zenoh.Session) -> None:
+        """Record the poses on a full key of this session, too."""
         sensor = Sensor(
-            session or self._client.session, key, (Odometry, PoseStamped), place_and_yaw,
+            session, key, (Odometry, PoseStamped), place_and_yaw,
             ("x", "y", "yaw"),
         )  # fmt: skip
         sensor.await_first("a pose (PoseStamped or Odometry)")

@@ -21,6 +21,7 @@ from msgspec.structs import replace
 
 from acsard.calibration.series import (
     MIN_ROWS,
+    TINY,
     Complexes,
     Floats,
     Mask,
@@ -195,9 +196,9 @@ def with_distance(log: Log, name: str, metres: Metres) -> Log:
 
 
 def _straightness(run: Run) -> float:
-    left, right = (float(side[-1] - side[0]) for side in (run.left, run.right))
+    left, right = float(run.left[-1]), float(run.right[-1])
     rolled = max(float(np.abs(np.diff(side)).sum()) for side in (run.left, run.right))
-    alike = 1 - abs(left - right) / (abs(left) + abs(right) + 1e-9)
+    alike = 1 - abs(left - right) / (abs(left) + abs(right) + TINY)
     return alike * min(abs(left), abs(right)) / rolled if rolled > MIN_STRAIGHT else 0.0
 
 
@@ -254,7 +255,7 @@ def _parsed(data: bytes) -> _Table:
     header = [name.strip() for name in lines[0].split(",")] if lines else []
     used = _used(header)
     picks = [header.index(name) for name in used]
-    run = header.index("run") if "run" in header else -1
+    run = header.index("run") if "run" in header else None
     values, runs, labels = array("d"), array("q"), dict[str, int]()
     cut = False
     for number, line in enumerate(lines[1:], 2):
@@ -273,7 +274,7 @@ def _parsed(data: bytes) -> _Table:
                 f'line {number} is "{printable(line[:60])}", which is not a number or an empty '
                 f"cell for each of the {len(header)} columns: {ADVICE}"
             ) from None
-        runs.append(labels.setdefault(cells[run] if run >= 0 else "", len(labels)))
+        runs.append(labels.setdefault("" if run is None else cells[run], len(labels)))
     if not runs:
         raise LogError("there are no rows below the header: record a drive")
     if len(labels) > MAX_RUNS:
@@ -292,8 +293,8 @@ def _parsed(data: bytes) -> _Table:
 
 def _used(header: Sequence[str]) -> list[str]:
     wheels = FOUR if set(FOUR) <= set(header) else TWO
-    places = ("x", "y") if {"x", "y"} <= set(header) else ()
-    sensors = [name for name in ("yaw_rate", "yaw") if name in header] + [*places]
+    places = ("x", "y") if "x" in header and "y" in header else ()
+    sensors = [name for name in ("yaw_rate", "yaw", *places) if name in header]
     missing = [name for name in ("t", *wheels) if name not in header]
     if not sensors:
         missing.append("yaw_rate (of a gyro) or x and y (positions)")
@@ -323,21 +324,22 @@ def _sides(table: _Table) -> tuple[Floats, Floats]:
         whole = np.isfinite(columns[front]) & np.isfinite(columns[rear])
         a, b = columns[front][whole], columns[rear][whole]
         kernel = np.ones(min(50, max(1, len(a))))
-        apart, rolled = (
+        difference, rolled = (
             float(np.abs(np.convolve(v, kernel, "valid")).sum()) if len(v) else 0.0
             for v in (a - b, np.maximum(np.abs(a), np.abs(b)))
         )
-        if apart > MAX_SIDE_DIFFERENCE * rolled:
+        share = difference / (rolled + TINY)
+        if share > MAX_SIDE_DIFFERENCE:
             odd, alive = (front, rear) if np.abs(a).sum() < np.abs(b).sum() else (rear, front)
             low, high = (a, b) if odd == front else (b, a)
             still = np.abs(low) < STANDSTILL_SPEED
             cause = f"has it another unit or other counts than {alive}, or is it of the other side"
-            if np.abs(high[still]).sum() > apart / rolled / 2 * np.abs(high).sum():
+            if np.abs(high[still]).sum() > share / 2 * np.abs(high).sum():
                 cause = "it stands still meanwhile: is its encoder dead, or its cable loose"
             elif float(low @ high) < 0.0:
                 cause = "it turns against it: has it the wrong sign, or is it of the other side"
             raise LogError(
-                f"{odd} rolls otherwise than {alive} by {apart / rolled:.0%} of the way: {cause}? "
+                f"{odd} rolls otherwise than {alive} by {share:.0%} of the way: {cause}? "
                 "Rename the columns of the working wheels to left and right, and leave the others "
                 "out"
             )
@@ -434,7 +436,7 @@ def integral(t: Floats, values: Floats) -> Floats:
 def _without_stuck(notes: Notes, run: Run) -> Run:
     # Leave out a gyro that repeats one value to the last digit while the wheels' turn changes.
     rate = run.rate
-    if len(rate) < 2:
+    if not len(rate):
         return run
     begins = np.concatenate(([0], np.flatnonzero(np.diff(rate)) + 1))
     ends = np.concatenate((begins[1:], [len(rate)])) - 1

@@ -18,6 +18,7 @@ from msgspec import Struct
 from acsard.calibration.fit import (
     AHEAD,
     ASIDE,
+    BETTER_DEVIATIONS,
     BIAS,
     GYRO_DELAY,
     POSE_DELAY,
@@ -27,7 +28,7 @@ from acsard.calibration.fit import (
     aligned,
 )
 from acsard.calibration.log import Run
-from acsard.calibration.series import Complexes, Floats
+from acsard.calibration.series import TINY, Complexes, Floats
 from acsard.core.config.settings import OdometryConfig
 from acsard.core.values import Seconds
 
@@ -41,7 +42,6 @@ OUTLIER = 9.0  # variances of a squared error, above which it counts as this
 MEDIAN = 0.455  # of a chi-square of one degree of freedom, whose mean is 1
 MAX_ANGLE = 0.2  # rad, that errors of positions may turn half a window
 FLOOR = 1e-7  # of a variance per metre or radian
-SURE = 2.0
 
 Row = list[float]
 # Columns of the rows: what multiplies each variance, and the squared error.
@@ -65,7 +65,7 @@ def noise(runs: Sequence[Run], fit: Fit, odometry: OdometryConfig, wheels: int =
     # Positions alone show the heading over long ways only, and so in whole runs.
     turns = {"gyro", "headings"} & set(fit.sensors)
     parts = [piece.run for piece in fit.pieces] if turns else runs
-    whole, passed = sum(run.seconds for run in parts) + 1e-9, 0.0
+    whole, passed = sum(run.seconds for run in parts) + TINY, 0.0
     for run in parts:
         for begin, heading, distance in _windows(run, fit):
             group = int(FOLDS * (passed + begin - run.t[0]) / whole)
@@ -219,7 +219,9 @@ def _fitted(rows: _Rows, stated: Floats) -> tuple[Floats, bool]:
                 - _likelihood(squares, features @ stated + sensor)
             )
     total = np.array(gains)
-    return variances, bool(total.sum() > SURE * math.sqrt(len(total)) * float(np.std(total)))
+    return variances, bool(
+        total.sum() > BETTER_DEVIATIONS * math.sqrt(len(total)) * float(np.std(total))
+    )
 
 
 def _likelihood(squares: Floats, variances: Floats) -> float:

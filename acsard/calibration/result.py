@@ -14,9 +14,10 @@ import numpy as np
 from msgspec import Struct
 from rich.console import RenderableType
 
+from acsard.calibration.comparison import Match, without
 from acsard.calibration.fit import AGREES, Errors, Fit, fit
 from acsard.calibration.geometry import LEFT, RIGHT, TRACK
-from acsard.calibration.hypotheses import NAMES, Match, examined, forward, without
+from acsard.calibration.hypotheses import NAMES, examined, forward
 from acsard.calibration.log import Log, LogError, Run, TapeReading
 from acsard.calibration.noise import Noise, noise
 from acsard.calibration.response import response_time
@@ -89,7 +90,8 @@ def calibrate(log: Log, config: Config, source: str) -> Result:
         _require_motion(log.runs, config)
         runs, matches, notes = examined(log.runs, config.drive)
         log = Log(tuple(runs), (*notes, *log.notes))
-        alone = _require_one_robot(runs, config, matches)
+        alone = _fits_alone(runs, config, matches)
+        _require_one_track(alone, config)
         found = fit(runs, config, matches)
         if not found.better and (vague := _vague(alone)):
             some = tuple(without(run, *vague) for run in runs)
@@ -178,10 +180,10 @@ def _track(found: Fit) -> float:
     return float(found.p[TRACK] - (found.p[LEFT] + found.p[RIGHT]) / 2)
 
 
-def _require_one_robot(
+def _fits_alone(
     runs: Sequence[Run], config: Config, matches: Mapping[str, Match]
 ) -> dict[str, Fit]:
-    # Sensors that contradict each other are not mixed: each is fitted alone first.
+    # The fit by each of several sensors.
     alone = dict[str, Fit]()
     if len(matches) < 2:
         return alone
@@ -190,6 +192,11 @@ def _require_one_robot(
         others = [other for other in NAMES if other != sensor]
         with suppress(LogError):  # it has too few values
             alone[sensor] = fit([without(run, *others) for run in some], config, {sensor: match})
+    return alone
+
+
+def _require_one_track(alone: Mapping[str, Fit], config: Config) -> None:
+    # Sensors that contradict each other are not mixed.
     values = {
         sensor: (_track(found), found.shares[0])
         for sensor, found in alone.items() if found.tracked
@@ -205,7 +212,6 @@ def _require_one_robot(
                 f"{NAMES[a]} and {NAMES[b]} contradict each other: the track is {words}, in wheel "
                 "separations. Leave the column of the wrong sensor out"
             )
-    return alone
 
 
 def _result(log: Log, config: Config, source: str, found: Fit) -> Result:

@@ -9,10 +9,13 @@ from __future__ import annotations
 
 import numpy as np
 import numpy.typing as npt
+from msgspec import Struct
 
 Floats = npt.NDArray[np.float64]
 Complexes = npt.NDArray[np.complex128]
 Mask = npt.NDArray[np.bool_]
+
+TINY = 1e-9  # beside a divisor that may be 0
 
 MIN_ROWS = 8
 BACK, NOISES = 0.2, 12.0  # of the jump to a wrong value; of the quartile of all jumps
@@ -22,12 +25,12 @@ FAR_SHARES, FAR_STEPS = 3.0, 5.0  # of the range of the values; of the usual ste
 # none together with the other side. Of two series in one side, 6 in 10 are found.
 CYCLE_ROWS, CYCLES, MIN_BLOCKS = range(2, 8), 6, 3  # rows of a cycle; cycles of a block; blocks
 MOVING, STILL, OTHER_SHARE = 0.3, 0.002, 0.15  # of the usual speed, twice; of the present speed
-STEPS, SURE = 1.2, 4.0  # jumps at slow speeds; standard deviations of the mean
+STEPS, MEAN_DEVIATIONS = 1.2, 4.0  # jumps at slow speeds; standard deviations of the mean
 MAX_OTHER, MIN_MOVING = 0.3, 5  # share of the blocks that move; and so many of them
 
 # Sides that jump by one factor in the same rows. Of coarse encoders whose board samples within a
 # tenth of its period, up to 0.86 of few jumps have one factor; of two writers, 0.94 and more.
-SAME, MOVED, UNLIKE, JUMP, ONE_FACTOR = 0.1, 0.1, 1.3, 0.15, 0.9
+SAME, MOVED, SPEED_RATIO, JUMP, ONE_FACTOR = 0.1, 0.1, 1.3, 0.15, 0.9
 MIN_JUMPS, JUMPS = 30, 0.04
 
 # A series has two levels beside another if this share of its rows is near one of them, this share
@@ -84,7 +87,7 @@ def by_turns(*columns: Floats | Complexes) -> bool:
                     for j, s, u in zip(jumps, slow, usual[:, 0], strict=True)]  # fmt: skip
             least = np.maximum(OTHER_SHARE * speed, STEPS * np.array(step)[:, None])
         spread = np.sqrt((np.abs(off - mean[:, :, None]) ** 2).mean(axis=2) / CYCLES)
-        other = np.abs(mean) > np.maximum(SURE * spread, least[:, :, None])
+        other = np.abs(mean) > np.maximum(MEAN_DEVIATIONS * spread, least[:, :, None])
         blocks = (other & moves[:, :, None]).all(axis=0).any(axis=1).sum()
         if blocks > MAX_OTHER * max(MIN_MOVING, moves.all(axis=0).sum()):
             return True
@@ -100,7 +103,7 @@ def by_chance(columns: Floats) -> bool:
     last, now, after = columns[:, :-2], columns[:, 1:-1], columns[:, 2:]
     size = np.minimum(np.abs(last), np.abs(after))
     steady = ((np.abs(after - last) < SAME * size) & (size > usual)).all(axis=0)
-    steady &= size.max(axis=0) > UNLIKE * size.min(axis=0)
+    steady &= size.max(axis=0) > SPEED_RATIO * size.min(axis=0)
     factors = 2 * now[:, steady] / (last + after)[:, steady]
     factor = factors.mean(axis=0)
     jumps = np.abs(factor - 1) > np.maximum(JUMP, np.ptp(factors, axis=0) / SAME)
@@ -112,33 +115,37 @@ def by_chance(columns: Floats) -> bool:
     return bool((np.abs(factor - middle) < SAME * abs(middle - 1)).mean() > ONE_FACTOR)
 
 
-def in_blocks(name: str, values: Floats, other_name: str, other: Floats) -> str:
-    """Return what shows that values are now this, now that share of others that stay, or ""."""
+class Levels(Struct, frozen=True):
+    """The two shares of another series that a series has in turn."""
+
+    low: float
+    high: float
+    changes: int  # from one to the other while the other series stays
+
+
+def in_blocks(values: Floats, other: Floats) -> Levels | None:
+    """Return two shares of `other` that `values` have in turn, or None if there is one share."""
     size = np.abs(other)
     usual = float(np.quantile(size, 0.9)) if len(size) else 0.0
     fast = np.flatnonzero(size > max(1e-6, FAST * usual))
     if len(fast) < MIN_FAST:
-        return ""
+        return None
     share = values[fast] / other[fast]
     low, high = np.quantile(share, [RARER, 1 - RARER])
     for _ in range(ROUNDS):
         upper = share > (low + high) / 2
-        if upper.all() or not upper.any():
-            return ""
+        if not upper.any():
+            return None
         low, high = np.median(share[~upper]), np.median(share[upper])
-    off, apart = np.abs(share - np.where(upper, high, low)), float(high - low)
+    off, distance = np.abs(share - np.where(upper, high, low)), float(high - low)
     spread = 1.48 * max(float(np.median(off[upper])), float(np.median(off[~upper])))
-    near = off < apart / 4
+    near = off < distance / 4
     rows, upper = fast[near], upper[near]
     kept = np.abs(np.diff(other[rows])) < STEADY * size[rows[1:]]
     changes = int(((np.diff(upper.astype(int)) != 0) & (np.diff(rows) < 4) & kept).sum())
     if (
         near.mean() < NEAR or min(upper.mean(), 1 - upper.mean()) < RARER or changes < CHANGES
-        or apart < max(SPREADS * spread, LEVELS_APART * max(abs(low), abs(high)))
+        or distance < max(SPREADS * spread, LEVELS_APART * max(abs(low), abs(high)))
     ):  # fmt: skip
-        return ""
-    return (
-        f"{name} is now {low:.2f}, now {high:.2f} times {other_name}, and changes {changes} times "
-        "while that stays, as if two programs or sensors wrote it by turns (two IMUs on one topic, "
-        "or a joint_state_publisher beside the driver)"
-    )
+        return None
+    return Levels(float(low), float(high), changes)

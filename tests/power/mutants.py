@@ -41,6 +41,9 @@ LARGE = 20
 """A whole number above this is changed by a quarter unless it is an index."""
 
 NAMES = {"min": "max", "max": "min", "any": "all", "all": "any", "sin": "cos", "cos": "sin"}
+# Functions whose arguments, or terms of a difference, have no order.
+SYMMETRIC = "min", "max", "np.minimum", "np.maximum", "math.hypot", "np.hypot", "isinstance"
+SIZES = "abs", "np.abs"
 FUNCTION = (ast.FunctionDef, ast.AsyncFunctionDef)
 MEMBERS = {"Mode": ["SHUTDOWN", "FAULT", "STOPPED", "INACTIVE", "WAITING", "DRIVING", "READY"]}
 
@@ -76,7 +79,7 @@ def variants(node: ast.AST, parent: ast.AST, field: str) -> Iterator[ast.AST]:
         case ast.BinOp(op=op) | ast.AugAssign(op=op):
             if type(op) in ARITHMETIC:
                 yield made(type(node), op=ARITHMETIC[type(op)]())
-            sized = isinstance(parent, ast.Call) and ast.unparse(parent.func) == "abs"
+            sized = isinstance(parent, ast.Call) and ast.unparse(parent.func) in SIZES
             if isinstance(node, ast.BinOp) and not isinstance(op, COMMUTATIVE) and not sized:
                 yield made(ast.BinOp, left=node.right, right=node.left)
         case ast.BoolOp(op=op, values=values):
@@ -110,7 +113,7 @@ def variants(node: ast.AST, parent: ast.AST, field: str) -> Iterator[ast.AST]:
                     yield args[0]
                 case ast.Attribute(attr=name) if name in NAMES:
                     yield made(ast.Call, func=ast.Attribute(func.value, NAMES[name]))
-            if len(args) > 1 and ast.unparse(func) not in ("min", "max", "isinstance"):
+            if len(args) > 1 and ast.unparse(func) not in SYMMETRIC:
                 yield made(ast.Call, args=[args[1], args[0], *args[2:]])
         case ast.Return(value=value) if value and not isinstance(value, ast.Constant):
             yield ast.Return(ast.Constant(None))

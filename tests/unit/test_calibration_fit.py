@@ -13,12 +13,14 @@ import numpy as np
 import pytest
 from msgspec import structs
 
+from acsard.calibration.comparison import Match
 from acsard.calibration.fit import (
     AHEAD,
     ASIDE,
     BIAS,
     GYRO_DELAY,
     POSE_DELAY,
+    SCALE,
     Errors,
     Fit,
     Piece,
@@ -28,9 +30,9 @@ from acsard.calibration.fit import (
     fit,
     moves,
 )  # fmt: skip
-from acsard.calibration.geometry import LEFT, RIGHT, TRACK, Base
-from acsard.calibration.log import LogError, Notes, TapeReading, run_of
-from acsard.core.config.settings import Config, OdometryConfig
+from acsard.calibration.geometry import LEFT, RIGHT, TRACK, Base, path
+from acsard.calibration.log import LogError, Notes, Run, TapeReading, run_of
+from acsard.core.config.settings import Config, DriveConfig, OdometryConfig
 from tests.unit.calibration_bags import motion
 from tests.unit.calibration_logs import (
     IDEAL,
@@ -408,3 +410,173 @@ LONG = motion(LEGS * 2)
 ROWS = np.zeros((2, 9))
 ROWS[0, [TRACK, LEFT, RIGHT]] = 1.0, -0.5, -0.5
 ROWS[1, [RIGHT, LEFT]] = 1.0, -1.0
+
+
+def test_halves_that_contradict_each_other_widen_by_half_of_their_difference() -> None:
+    first, second = (sensed("gyro", name=name, drive=LONG) for name in "ab")
+    scale = 1.3
+    second = structs.replace(second, left=scale * second.left, right=scale * second.right)
+    found, alone = (fit(runs, Config()) for runs in ([first, second], [first]))
+    assert found.halves == pytest.approx(math.log(scale), rel=0.1)
+    # The pieces scatter by as much from their mean, and there are more than twelve.
+    assert len(found.pieces) >= 12
+    jackknife = math.log(scale) / 2 / math.sqrt(len(found.pieces) - 1)
+    wide = math.sqrt(found.shares[0] ** 2 - found.gyro_std**2)
+    assert wide == pytest.approx(math.hypot(found.halves / 2, jackknife), rel=0.07)
+    assert alone.shares[0] == pytest.approx(alone.gyro_std, rel=0.01)
+    much = structs.replace(second, left=2 * second.left, right=2 * second.right)
+    assert fit([first, much], Config()).halves == 0.6  # at most
+
+
+def test_a_robot_that_never_turns_shows_no_track() -> None:
+    straight = motion([(2, 0, 0), (6, 0.4, 0), (6, -0.3, 0), (6, 0.2, 0), (2, 0, 0)])
+    found = fit([sensed("gyro", drive=straight)], Config())
+    assert not found.tracked
+    assert found.shares[0] == pytest.approx(1.0, rel=0.05)  # as before the log
+    assert found.shares[1] < 0.002
+
+
+def test_errors_of_turns_are_those_of_the_configured_track() -> None:
+    spins = motion([(2, 0, 0), (12, 0.2, 0.8), (2, 0, 0), (12, 0.2, -0.8), (2, 0, 0)])
+    for sensor in ("gyro", "headings"):
+        for multiplier in (1.0, 2.0):
+            config = Config(drive=DriveConfig(wheel_separation_multiplier=multiplier))
+            found = fit([sensed(sensor, drive=spins)], config)
+            assert found.turn
+            expected = math.tau * abs(1.4925 / multiplier - 1)
+            assert found.turn.now == pytest.approx(expected, rel=0.06)
+            assert found.turn.new < 0.02 * math.tau
+            assert found.place is None
+            assert found.readings is None
+
+
+def test_the_gain_is_that_of_the_errors_on_pieces_that_were_left_out() -> None:
+    run = sensed("positions")
+    run.place[:] += 0.02 * np.random.default_rng(3).normal(size=(2, len(run.place))).T @ [1, 1j]
+    matches = {"positions": Match("positions", 0.1, 1.5, 0.0, 0.1)}
+    found = fit([run], Config(), matches)
+    assert found.place
+    assert found.place.new == pytest.approx(0.02, rel=0.1)
+    assert found.gain == pytest.approx(math.log(found.place.now / found.place.new))
+    assert found.gain == found.worst
+    both = fit([structs.replace(run, **gyro_of(sensed("gyro")))], Config(), matches)
+    assert both.place
+    by_places = math.log(both.place.now / both.place.new)
+    assert both.worst == pytest.approx(min(by_places, both.gain - by_places))
+    assert both.gain - by_places > 2.0  # of the gyro
+    assert both.sensors == ("gyro", "positions")
+
+
+def gyro_of(run: Run) -> dict[str, Floats]:
+    return {"gyro_t": run.gyro_t, "rate": run.rate, "turned": run.turned}
+
+
+def measured(run: Run, **readings: tuple[float, float]) -> Run:
+    """Return the run without its sensors, with these readings and their deviations."""
+    none = np.zeros(0)
+    return structs.replace(
+        run, gyro_t=none, rate=none, turned=none, place_t=none, place=none + 0j, yaw_t=none,
+        yaw=none, tape=tuple(TapeReading(name, *reading) for name, reading in readings.items()),
+    )  # fmt: skip
+
+
+AHEAD_2_M = motion([(1, 0, 0), (5, 0.4, 0), (1, 0, 0)])
+ROUND = motion([(1, 0, 0), (2 * math.pi, 0, 1.0), (1, 0, 0)])
+
+
+def test_a_reading_by_tape_is_as_sure_as_it_says() -> None:
+    ahead, turn = sensed("gyro", drive=AHEAD_2_M), sensed("gyro", drive=ROUND)
+    for std in (0.01, 0.04):
+        readings = [measured(ahead, distance=(2.02, std)), measured(turn, turn=(math.tau, 3 * std))]
+        found = fit(readings, Config())
+        assert found.sized
+        assert found.tracked
+        assert found.sensors == ("tape",)
+        # Together with the 1.4 % of both wheels before.
+        size = 1 / math.hypot(2.02 / std, math.sqrt(2) / 0.02)
+        assert found.shares[2] == pytest.approx(size, rel=0.03)
+        assert found.shares[0] == pytest.approx(3 * std / math.tau, rel=0.03)
+    assert found.readings
+    assert found.readings.now > 5
+
+
+@pytest.mark.parametrize(
+    ("sensors", "reading", "shown"),
+    [
+        (("gyro",), None, False),
+        (("gyro",), "distance", False),
+        (("gyro",), "turn", True),
+        (("gyro", "headings"), None, True),
+        (("headings",), None, True),
+    ],
+)
+def test_only_another_sensor_shows_the_scale_of_a_gyro(
+    sensors: tuple[str, ...], reading: str | None, shown: bool
+) -> None:
+    runs = [sensed(*sensors)]
+    if reading:
+        drive, value = (AHEAD_2_M, 2.0) if reading == "distance" else (ROUND, math.tau)
+        runs.append(measured(sensed("gyro", drive=drive), **{reading: (value, 0.01)}))
+    found = fit(runs, Config(odometry=OdometryConfig(gyro_scale_std=0.02)))
+    assert found.gyro_std == (0.0 if shown else 0.02)
+    assert (found.shares[0] >= 0.02) is not shown
+
+
+def test_a_hole_in_a_gyro_is_longer_than_8_periods_and_0_3_s() -> None:
+    run = sensed("gyro")
+    whole = Piece(run, Base.of(Config().drive))
+    p = np.zeros(9)
+    steps = int(np.isfinite(whole.residuals(p)["gyro"]).sum())
+    for seconds, lost in ((0.25, 0), (0.35, 0), (0.45, 1), (3.0, 4)):
+        kept = ~((run.gyro_t > 20.2) & (run.gyro_t < 20.2 + seconds))
+        some = structs.replace(
+            run, gyro_t=run.gyro_t[kept], rate=run.rate[kept], turned=run.turned[kept]
+        )
+        left = np.isfinite(Piece(some, whole.base).residuals(p)["gyro"]).sum()
+        assert left == steps - lost
+    thin = structs.replace(run, gyro_t=run.gyro_t[::2], rate=run.rate[::2], turned=run.turned[::2])
+    assert np.isfinite(Piece(thin, whole.base).residuals(p)["gyro"]).sum() == steps
+    late = np.zeros(9)
+    late[GYRO_DELAY] = 5.0  # whose last steps have no sample
+    assert np.isfinite(whole.residuals(late)["gyro"]).sum() < steps
+
+
+def test_only_a_gyro_and_headings_during_the_wheels_are_compared() -> None:
+    run = sensed("headings", "positions")
+    for name, sizes in (("headings", 1), ("positions", 2)):
+        whole = Piece(run, Base.of(Config().drive)).residuals(np.zeros(9))[name]
+        assert np.isfinite(whole).all()
+        late = np.zeros(9)
+        late[POSE_DELAY] = 4.05  # 21 of 5 Hz are before the wheels
+        off = Piece(run, Base.of(Config().drive)).residuals(late)[name]
+        assert (~np.isfinite(off)).sum() == 21 * sizes
+
+
+def test_each_sensor_has_its_delay_and_a_gyro_its_scale() -> None:
+    run = sensed("gyro", "positions", lever=0.1 + 0j)
+    wrong = structs.replace(
+        run, gyro_t=run.gyro_t + 0.8, rate=1.01 * run.rate, turned=1.01 * run.turned
+    )
+    matches = {
+        "gyro": Match("gyro", 0.02, 1.5, 0.8, 0.02),
+        "positions": Match("positions", 0.02, 1.5, 0.0, 0.02, lever=(0.1, 0.0)),
+    }
+    found = fit([wrong], Config(), matches)
+    assert found.p[GYRO_DELAY] == pytest.approx(0.8, abs=0.01)
+    assert found.p[POSE_DELAY] == pytest.approx(0.0, abs=0.01)
+    assert found.p[AHEAD] == pytest.approx(0.1, abs=0.01)
+    assert found.p[SCALE] == pytest.approx(-math.log(1.01), abs=0.006)
+    assert multipliers(found) == pytest.approx([1.5, 1.0, 1.01], abs=0.006)
+
+
+def test_a_path_is_made_of_arcs() -> None:
+    half = math.pi / 2
+    place, heading = path(np.array([1.0, half, half * 2]), np.array([0.0, half, -half * 2]))
+    assert heading == pytest.approx([0.0, 0.0, half, -half])
+    assert place == pytest.approx([0, 1, 2 + 1j, 4 + 1j])
+    base = Base(0.1, 0.2, 0.5)
+    distance, turn = base.motion(np.zeros(3), np.array([3.0]), np.array([4.0]))
+    assert (distance[0], turn[0]) == pytest.approx((0.55, 1.0))
+    wider = np.array([math.log(2), math.log(0.5), math.log(4)])
+    distance, turn = base.motion(wider, np.array([3.0]), np.array([4.0]))
+    assert (distance[0], turn[0]) == pytest.approx((0.5, -0.1))

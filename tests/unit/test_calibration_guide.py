@@ -5,15 +5,18 @@ from __future__ import annotations
 import cmath
 import math
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import nullcontext
+from functools import partial
 from types import SimpleNamespace
+from typing import Any
 from unittest.mock import MagicMock
 
 import numpy as np
 import pytest
 from msgspec.structs import replace
 
+from acsard.calibration import guide
 from acsard.calibration.geometry import Base
 from acsard.calibration.guide import MAX_REPEATS, Options, drive, guided, require_own
 from acsard.calibration.leg import require_path
@@ -24,7 +27,7 @@ from acsard.calibration.series import Floats
 from acsard.core.config.parsing import effective, parse
 from acsard.core.config.settings import Config
 from acsard.core.values import AcsardError
-from acsard.host.errors import NoAnswerError, NotDrivenError
+from acsard.host.errors import NoAnswerError, NotDrivenError, UsageError
 from acsard.terminal.prompt import NumberQuestion, Prompt
 
 STEP_S, LINE_M, WHEELBASE_M, WIDTH_M = 0.02, 0.45, 0.25, 0.30
@@ -308,6 +311,100 @@ def test_a_robot_that_is_stopped_already_is_named_before_the_first_question() ->
         drive(client, Options("tape"), Prompt(), "", Config())
 
 
+class Rides:
+    """A daemon that answers queries, and the robot that a guided drive rides."""
+
+    def __init__(self, text: str = "", mode: str = "ready") -> None:
+        self.answers: dict[str, object] = {
+            "info": SimpleNamespace(simulated=True, version="1.2"),
+            "config": effective(parse(text.encode())),
+            "state": SimpleNamespace(mode=mode, why="stopped by phone"),
+        }
+        self.where = SimpleNamespace(robot_id="acsar", endpoint="tcp/a", tls=None)
+        self.session, self.robot, self.sensors = "the session", Robot(1.5), list[str]()
+        self.disturbs: Callable[[], None] = lambda: None
+
+    def get(self, name: str) -> Any:
+        return self.answers[name]
+
+    def key(self, name: str) -> str:
+        return f"acsard/acsar/{name}"
+
+    def add_gyro(self) -> None:
+        self.sensors.append("gyro")
+
+    def add_poses(self, key: str, session: object) -> None:
+        self.sensors.append(f"{key} of {session}")
+
+    def ride(self, leg: Leg) -> Run:
+        self.disturbs()
+        return self.robot.ride(leg)
+
+    def drive(self, monkeypatch: pytest.MonkeyPatch, options: Options) -> tuple[Log, Config]:
+        monkeypatch.setattr(guide, "Recorder", lambda client, config, prompt: self)
+        client: Any = self
+        return drive(client, options, self.robot, "", Config())
+
+
+@pytest.mark.parametrize(
+    ("text", "options", "sensors", "legs"),
+    [
+        ("", Options(), [], 4),
+        ("[odometry]\ngyro = true\n", Options(), ["gyro"], 2),
+        ("[odometry]\ngyro = true\n", Options(poses="mocap"), ["mocap of the session"], 2),
+        ("", Options(poses="sim/pose"), ["acsard/acsar/sim/pose of the session"], 2),
+        ("[odometry]\ngyro = true\n", Options("tape"), [], 4),
+    ],
+)
+def test_the_method_follows_from_the_options_and_the_gyro(
+    monkeypatch: pytest.MonkeyPatch, text: str, options: Options, sensors: list[str], legs: int
+) -> None:
+    robot = Rides(text)
+    log, config = robot.drive(monkeypatch, options)
+    assert robot.sensors == sensors
+    assert len(log.runs) == legs
+    assert config == parse(text.encode())
+
+
+def test_whatever_ends_a_guided_drive_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    def raises(error: BaseException) -> Callable[[], None]:
+        def disturb() -> None:
+            raise error
+
+        return disturb
+
+    robot = Rides()
+    robot.disturbs = raises(KeyboardInterrupt())
+    with pytest.raises(LogError, match="the operator ended the drive"):
+        robot.drive(monkeypatch, Options())
+    robot.disturbs = raises(NotDrivenError("a reason"))
+    with pytest.raises(NotDrivenError, match="a reason"):
+        robot.drive(monkeypatch, Options())
+
+    def stopped() -> None:
+        robot.answers["state"] = SimpleNamespace(mode="stopped", why="stopped by phone")
+        raise NotDrivenError("a reason")
+
+    robot.disturbs = stopped
+    with pytest.raises(NotDrivenError, match="stopped by phone"):
+        robot.drive(monkeypatch, Options())
+    for name, other in (
+        ("info", SimpleNamespace(simulated=False)),
+        ("config", effective(parse(b"[drive]\nwheel_radius = 0.06\n"))),
+    ):
+        robot = Rides()
+        robot.disturbs = partial(robot.answers.__setitem__, name, other)
+        with pytest.raises(LogError, match="another robot answers, or its settings were changed"):
+            robot.drive(monkeypatch, Options())
+    robot.answers["info"] = SimpleNamespace(simulated=False)
+    with pytest.raises(UsageError, match="--yes is only for the built-in simulator"):
+        robot.drive(monkeypatch, Options(without_person=True))
+    robot = Rides()
+    robot.answers["config"] = {"drive": {"wheel_radius": "a"}}
+    with pytest.raises(LogError, match=r"cannot read .* use the daemon's version, 1\.2"):
+        robot.drive(monkeypatch, Options())
+
+
 @pytest.mark.parametrize(
     ("text", "words"),
     [
@@ -318,3 +415,71 @@ def test_a_robot_that_is_stopped_already_is_named_before_the_first_question() ->
 def test_a_robot_that_cannot_be_guided_is_refused(text: str, words: str) -> None:
     with pytest.raises(LogError, match=words):
         Setup.of(parse(text.encode()))
+
+
+@pytest.mark.parametrize(
+    ("ratio", "words"),
+    [(0.84, "it turned 302 deg"), (0.86, ""), (2.99, ""), (3.01, "it turned 1084 deg")],
+)
+def test_a_turn_of_a_credible_track_is_one(ratio: float, words: str) -> None:
+    """The effective track is 0.85 to 3 wheel separations."""
+    t = np.linspace(0.0, 9.0, 90)
+    half = ratio * math.tau * Config().drive.wheel_separation / Config().drive.wheel_radius / 2 / 9
+    still = np.full(len(t), half)
+    run = run_of("round", {"left right": (t, -still, still)}, Notes())
+    (leg,) = (leg for leg in legs("tape", SETUP) if leg.by_key)
+    asked: list[str] = []
+
+    class Stranger(Prompt):
+        def start(self, text: str) -> None:
+            asked.append(text)
+            if len(asked) > 1:
+                raise KeyboardInterrupt
+
+        def show_text(self, text: str) -> None:
+            asked.append(text)
+
+        def instruct(self, text: str) -> None:
+            pass
+
+    with pytest.raises(KeyboardInterrupt) if words else nullcontext():
+        assert guide._repeated(leg, "", Stranger(), lambda leg: run, Config().drive) is run
+    assert words in asked[-2 if words else -1]
+
+
+@pytest.mark.parametrize(
+    ("text", "field", "value"),
+    [
+        ("", "speed", 0.3),
+        ("[limits]\nlinear_speed = 0.2\n", "speed", 0.2),
+        ("[limits]\nlinear_deceleration = 0.2\n", "speed", 0.2),  # it stops within 0.1 m
+        ("[limits]\nwheel_speed = 5.0\n", "speed", 0.225),
+        ("[limits]\nwheel_speed = 5.0\n", "rolling_speed", 0.225),  # 90 % of it
+        ("", "rolling_speed", 0.5),
+        ("", "length", 2.0),
+        ("", "reach", 0.25),
+        ("[drive]\nwheel_separation = 1.0\n", "length", 1.15),
+    ],
+)
+def test_a_guided_drive_has_the_speed_and_length_that_robot_and_floor_allow(
+    text: str, field: str, value: float
+) -> None:
+    assert getattr(Setup.of(parse(text.encode())), field) == pytest.approx(value)
+
+
+def test_a_person_stands_beside_a_robot_that_is_not_known_to_skid() -> None:
+    assert not Options().without_person
+    for method in METHODS:
+        assert legs(method, SETUP) == legs(method, SETUP, 1.0)
+
+
+def test_the_least_limits_of_a_guided_drive() -> None:
+    for text, some in (
+        ("linear_speed = 0.051", True), ("linear_speed = 0.049", False),
+        ("angular_speed = 0.21", True), ("angular_speed = 0.19", False),
+    ):  # fmt: skip
+        with nullcontext() if some else pytest.raises(LogError, match=r"needs 0\.05 m/s and 0\.2"):
+            Setup.of(parse(f"[limits]\n{text}\n".encode()))
+    for separation, some in ((1.22, True), (1.26, False)):  # of which 0.8 m are left
+        with nullcontext() if some else pytest.raises(LogError, match="too large for a floor"):
+            Setup.of(parse(f"[drive]\nwheel_separation = {separation}\n".encode()))

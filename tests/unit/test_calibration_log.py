@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import Any
 
@@ -257,3 +258,133 @@ def test_a_distance_is_as_sure_as_a_tape() -> None:
     for left, right in ((2.0, 2.6), (2.0, -2.0), (0.5, 0.5)):  # curved, on the spot, too short
         with pytest.raises(LogError, match="is not straight"):
             with_distance(read(text(series(t, 0 * t + left, 0 * t + right, 0 * t))), "", 0.6)
+
+
+def test_a_distance_is_not_that_of_a_run_that_rocks() -> None:
+    t = np.arange(0.0, 6.0, 0.05)
+    for rocks, straight in ((0.0, True), (6.0, False)):
+        for sides in ((2 + rocks * np.sin(t * math.tau), 0 * t + 2),
+                      (0 * t + 2, 2 + rocks * np.sin(t * math.tau))):  # fmt: skip
+            log = read(text(series(t, *sides, 0 * t)))
+            if straight:
+                assert len(with_distance(log, "", 0.6).runs) == 2
+            else:
+                with pytest.raises(LogError, match="is not straight"):
+                    with_distance(log, "", 0.6)
+
+
+def test_the_straightness_that_a_distance_needs_is_90_percent() -> None:
+    t = np.arange(0.0, 6.0, 0.05)
+    for share, straight in ((1.068, True), (1.075, False)):
+        log = read(text(series(t, 0 * t + 2.0, 0 * t + 2.0 * share, 0 * t)))
+        if straight:
+            assert with_distance(log, "1", 0.6).runs[-1].tape[0].value == 0.6
+        else:
+            with pytest.raises(LogError, match="is not straight"):
+                with_distance(log, "1", 0.6)
+
+
+def test_a_measured_run_rolls_5_rad_at_least_ahead_or_back() -> None:
+    t = np.arange(0.0, 6.0, 0.05)
+    for rolled, straight in ((4.9, False), (5.1, True), (-5.1, True)):
+        log = read(text(series(t, *(0 * t + rolled / t[-1],) * 2, 0 * t)))
+        if straight:
+            assert with_distance(log, "", 0.25).runs[-1].name == "1"
+        else:
+            with pytest.raises(LogError, match="is not straight"):
+                with_distance(log, "", 0.25)
+
+
+def test_a_part_behind_a_gap_needs_8_rows_too() -> None:
+    t = 0.3 * np.arange(20)
+    for rows, runs in ((7, 1), (8, 2)):
+        log = read(steady(np.concatenate((t, 90 + t[:rows]))))
+        assert len(log.runs) == runs
+        log = read(steady(np.concatenate((90 + t, t[:rows]))))
+        assert len(log.runs) == runs
+
+
+def test_a_column_beside_the_needed_one_may_have_its_name_with_a_unit() -> None:
+    log = read(text([f"{line},9" for line in lines()], f"{HEADER},left_rpm"))
+    assert log.notes == ("columns not used: left_rpm",)
+
+
+def test_an_encoder_at_rest_may_rock_by_0_03_rad() -> None:
+    t = np.arange(0.0, 6.0, 0.05)
+    for speed, rests in ((0.07, True), (0.08, False)):
+        for sides in ((speed, 0.0), (0.0, -speed)):
+            (run,) = read(text(series(t, 0 * t + sides[0], 0 * t + sides[1], 0 * t))).runs
+            assert run.rests(np.array([3.0])).tolist() == [rests]
+    at = np.array([0.19, 0.21, 5.74, 5.76])  # within 0.4 s around them
+    assert run.rests(at).tolist() == [False] * 4
+    (run,) = read(steady_at_zero(t)).runs
+    assert run.rests(at).tolist() == [False, True, True, False]
+
+
+def steady_at_zero(t: Floats) -> bytes:
+    return text(series(t, 0 * t, 0 * t, 0 * t))
+
+
+def test_all_columns_of_a_run_begin_at_its_first_row_of_the_wheels() -> None:
+    t = 100.0 + 0.05 * np.arange(200)
+    header = "t,left,right,yaw_rate,x,y,yaw,applied_linear,applied_angular"
+    (run,) = read(text(series(t, 0 * t + 2, 0 * t + 3, 0 * t + 0.5, t, -t, 0.1 * t, 0 * t + 0.4,
+                              0 * t - 0.3), header)).runs  # fmt: skip
+    for times in (run.t, run.gyro_t, run.place_t, run.yaw_t, run.commands_t):
+        assert np.asarray(times) == pytest.approx(t - 100.0)
+    assert run.place[0] == pytest.approx(100 - 100j)
+    assert run.yaw[-1] == pytest.approx(0.1 * t[-1], abs=1e-4)
+    assert run.commands[0] == pytest.approx([0.4, -0.3])
+    assert (run.left[-1], run.right[-1]) == pytest.approx((2 * 9.95, 3 * 9.95))
+    assert run.turned[-1] == pytest.approx(0.5 * 9.95)
+    part = run.part(2.0, 4.0)
+    assert [len(v) for v in (part.t, part.place_t, part.yaw_t, part.place, part.yaw)] == [41] * 5
+    assert len(part.gyro_t) == len(part.rate) == len(run.gyro_t)  # its delay is not known yet
+    assert (part.place_t[0], part.place_t[-1]) == pytest.approx((2.0, 4.0))
+    assert part.seconds == pytest.approx(2.0)
+
+
+def test_sensors_may_begin_earlier_and_end_later_than_the_wheels() -> None:
+    rows = [(0.05 * n, "2", "2", "") for n in range(400)]
+    rows += [(0.05 * n + 0.01, "", "", "0.1") for n in range(-100, 500)]
+    data = text([f"{t:.2f},{a},{b},{w}" for t, a, b, w in sorted(rows)])
+    (run,) = read(data).runs
+    assert (run.gyro_t[0], run.gyro_t[-1]) == pytest.approx((-1.0, 20.9), abs=0.06)
+    data = text([f"{t:.2f},{a},{b},{w}" for t, a, b, w in sorted(rows) if not (a and t > 4.0)])
+    (run,) = read(data).runs
+    assert (run.gyro_t[0], run.gyro_t[-1]) == pytest.approx((-0.4, 4.4), abs=0.06)
+
+
+def test_programs_that_write_all_wheels_by_turns_are_named() -> None:
+    speed = np.repeat([0.1, 2.0], [36, 120])
+    mixed = np.where(np.arange(len(speed)) % 2, 0.5 * speed, speed)
+    t = 0.05 * np.arange(len(speed))
+    with pytest.raises(LogError, match=r"^in left and right, two series of values alternate"):
+        read(text(series(t, mixed, mixed, 0 * t)))
+    (run,) = read(text(series(t, mixed, speed, 0 * t))).runs
+    assert run.mixed == "left"  # it may be a coarse encoder
+
+
+def test_rows_with_the_time_of_another_row_are_left_out() -> None:
+    rows = lines()
+    rows.insert(51, rows[50].replace(",2,", ",9,"))
+    log = read(text(rows))
+    assert len(log.runs[0].t) == 200
+    assert log.notes == (
+        "rows of left right left out, with the time of another row: 1",
+        "rows of yaw_rate left out, with the time of another row: 1",
+    )
+    assert log.runs[0].right[-1] == pytest.approx(2 * 9.95)
+
+
+def test_of_two_wheels_of_a_side_the_one_that_stands_is_dead() -> None:
+    t = 0.05 * np.arange(400)
+    turn = 3 * np.sin(t)
+    for stands, words in ((0.019, "it stands still meanwhile"), (0.021, "another unit")):
+        rear = np.where(t > 10.0, stands, turn)
+        rows = series(t, turn, turn, rear, turn, 0 * t)
+        with pytest.raises(LogError, match=f"rl rolls otherwise than fl by .*{words}"):
+            read(text(rows, "t,fr,fl,rl,rr,yaw_rate"))
+    rows = series(t, turn, turn, turn, np.where(t > 10.0, 0.0, turn), 0 * t)
+    with pytest.raises(LogError, match=r"rr rolls otherwise than fr by .*it stands still"):
+        read(text(rows, "t,fr,fl,rl,rr,yaw_rate"))

@@ -11,16 +11,31 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any, cast
 
 import numpy as np
 import pytest
 from msgspec import Struct, structs
 
-from acsard.calibration.fit import fit
-from acsard.calibration.geometry import LEFT, RIGHT, TRACK
+from acsard.calibration import noise as noises
+from acsard.calibration.fit import AHEAD, ASIDE, Piece, fit
+from acsard.calibration.geometry import LEFT, RIGHT, TRACK, Base
 from acsard.calibration.log import Log, Run
-from acsard.calibration.noise import noise
+from acsard.calibration.noise import (
+    SQUARE,
+    Path,
+    _bend,
+    _distance,
+    _fitted,
+    _heading,
+    _likelihood,
+    _Rows,
+    _solved,
+    noise,
+)
 from acsard.calibration.result import calibrate
+from acsard.calibration.series import Complexes
 from acsard.core.config.settings import Config, DriveConfig, OdometryConfig
 from acsard.core.link.feedback import Line
 from acsard.core.values import WheelSpeeds
@@ -321,3 +336,154 @@ def test_the_noise_of_wheels_that_roll_by_chance_is_found(
         assert shown.scale < 1e-5
     else:
         assert shown.distance_per_metre is None
+
+
+# the least squares of the windows
+
+
+def windows(count: int = 60, **variances: float) -> Floats:
+    """Return rows of windows whose squared errors are exactly what their variances give."""
+    rng = np.random.default_rng(1)
+    roll, spin = rng.uniform(0.5, 5.0, count), rng.uniform(0.1, 9.0, count)
+    way = spin * rng.uniform(-1.0, 1.0, count)
+    features = np.array([roll, spin, way**2, roll**2, np.ones(count)]).T
+    names = ("metre", "radian", "track", "ratio", "sensor")
+    return np.column_stack((features, features @ [variances.get(name, 0.0) for name in names]))
+
+
+ALL = {"metre": 1e-3, "radian": 2e-3, "track": 3e-4, "ratio": 4e-4, "sensor": 5e-3}
+
+
+def test_each_source_of_noise_has_its_share() -> None:
+    assert _solved(windows(60, **ALL)) == pytest.approx(list(ALL.values()), rel=0.2)
+    for number, (name, value) in enumerate(ALL.items()):
+        shares = _solved(windows(60, **{name: value}))
+        assert shares[number] == pytest.approx(value, rel=0.01)
+        assert np.delete(shares, number) == pytest.approx([0.0] * 4, abs=1e-5)
+
+
+def test_single_windows_hardly_change_the_noise() -> None:
+    table = windows(60, **ALL)
+    table[::20, SQUARE] *= 1e4
+    true = table[:, :SQUARE] @ [*ALL.values()]
+    assert (table[:, :SQUARE] @ _solved(table)).mean() < 2.5 * true.mean()
+    still = windows(metre=1e-3)
+    still[:, 2] = 0.0  # a source that no window has is none
+    assert _solved(still)[:3] == pytest.approx([1e-3, 0.0, 0.0], abs=1e-5)
+
+
+def rows(table: Floats) -> _Rows:
+    made = _Rows()
+    for number, row in enumerate(table.tolist()):
+        made.add(row, 5 * number // len(table))
+    return made
+
+
+def test_noise_is_better_if_it_explains_windows_that_it_was_not_fitted_to() -> None:
+    rng = np.random.default_rng(2)
+    table = windows(200, **ALL)
+    table[:, SQUARE] *= rng.chisquare(1, len(table))
+    true = np.array([*ALL.values()])
+    for factor, better in ((1.0, False), (10.0, True), (0.1, True)):
+        variances, found = _fitted(rows(table), factor * true)
+        assert found is better
+        assert (table[:, :SQUARE] @ variances).mean() == pytest.approx(
+            (table[:, :SQUARE] @ true).mean(), rel=0.3
+        )
+    for count, known in ((20, False), (21, True)):
+        variances, found = _fitted(rows(windows(count, **ALL)), 100 * true)
+        assert bool(variances.any()) is known
+        assert found is known
+    made = rows(windows(20, **ALL))
+    made.add(None, 0)
+    made.add([math.nan] * 6, 0)
+    assert len(made.rows) == len(made.groups) == 20
+
+
+def test_the_likelihood_is_that_of_normal_errors_up_to_five_deviations() -> None:
+    squares, variances = np.array([0.0, 4.0, 1e6]), np.array([1.0, 2.0, 2.0])
+    assert _likelihood(squares, variances) == pytest.approx(-(2 * math.log(2) + 2 + 25) / 2)
+
+
+def at_ends(**ends: tuple[float, float]) -> Path:
+    """Return a path with these values at two times."""
+    names = ("heading", "rolled", "turned", "x", "y")
+    columns = tuple(np.array(ends.get(name, (0.0, 0.0))) for name in names)
+    return cast("Path", SimpleNamespace(at=lambda t: columns))
+
+
+def test_a_window_has_the_squares_of_its_errors() -> None:
+    ends = np.zeros(2)
+    path = at_ends(heading=(1.0, 1.5), rolled=(2.0, 5.0), turned=(1.0, 3.0))
+    row = _heading(path, ends, 0.7)
+    assert row == pytest.approx([3.0, 2.0, 0.25, 9.0, 1.0, 0.04])
+    assert _heading(path, ends, 0.7 + math.tau) == pytest.approx(row)  # a wrapped heading
+    assert _heading(at_ends(rolled=(2.0, 2.0009)), ends, 0.1) is None
+    assert _heading(at_ends(rolled=(2.0, 2.0011)), ends, 0.1)
+    path = at_ends(rolled=(1.0, 6.0), x=(1.0, 4.0), y=(0.0, 3.0))
+    assert _distance(path, ends, 4j) == pytest.approx(
+        [5.0, 0.0, 0.0, 25.0, 1.0, (4 - math.sqrt(18)) ** 2]
+    )
+    for way, straight in ((0.81, True), (0.79, False)):
+        row = _distance(at_ends(rolled=(0.0, 1.0), x=(0.0, way)), ends, 1.0)
+        assert (row is not None) is straight
+    assert _distance(at_ends(rolled=(0.0, 0.019), x=(0.0, 0.019)), ends, 0.1) is None
+
+
+def test_positions_bend_by_the_turn_of_a_half_window_to_the_other() -> None:
+    t = np.arange(40.0)
+    x = 0.3 * t
+    straight: Any = SimpleNamespace(at=lambda t: (0 * x, x, 0.2 * x, x, 0 * x))
+    bend = 0.05
+    seen: Complexes = np.asarray(x, dtype=np.complex128)
+    seen[20:] = seen[19] + (seen[20:] - seen[19]) * np.exp(1j * bend)
+    row = _bend(straight, t, np.asarray((3 - 2j) + np.exp(0.4j) * seen))
+    assert row
+    roll, spin, way, rolled, sensor, square = row
+    assert square == pytest.approx(bend**2)
+    # A turn in the middle bends the whole, and one at an end bends nothing.
+    assert spin / roll == pytest.approx(0.2)
+    assert 0.5 * x[-1] / 2 < roll < x[-1]
+    assert way == 0.0
+    assert rolled == pytest.approx((0.5 * x[-1]) ** 2, rel=0.1)
+    assert sensor == pytest.approx(2 / ((x[:20] - x[:20].mean()) ** 2).sum(), rel=0.01)
+    assert _bend(straight, t[:7], seen[:7]) is None
+    standing: Any = SimpleNamespace(at=lambda t: (0 * x,) * 5)
+    assert _bend(standing, t, np.zeros_like(seen)) is None
+
+
+def test_the_noise_is_compared_with_that_of_the_configuration(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    seen: list[Floats] = []
+
+    def fitted(rows: _Rows, stated: Floats) -> tuple[Floats, bool]:
+        seen.append(stated)
+        return np.zeros(5), False
+
+    monkeypatch.setattr(noises, "_fitted", fitted)
+    odometry = OdometryConfig(
+        yaw_variance_per_metre=1e-3, yaw_variance_per_radian=2e-3, distance_scale_std=0.03,
+        wheel_separation_multiplier_std=0.1, wheel_radius_ratio_std=0.02,
+        distance_variance_per_metre=5e-4,
+    )  # fmt: skip
+    found = fit([sensed("gyro")], Config())
+    shown = noise([sensed("gyro")], found, odometry)
+    # The track is 1.5 times the separation of 0.3 m, and its deviation is one of the multiplier.
+    track = 0.3 * math.exp(found.p[TRACK])
+    assert seen[0] == pytest.approx([1e-3, 2e-3, (0.1 * 0.3 / track) ** 2, (0.02 / track) ** 2, 0])
+    assert seen[1] == pytest.approx([5e-4, 0.0, 0.0, 9e-4, 0.0])
+    assert (shown.yaw_per_metre, shown.yaw_per_radian, shown.distance_per_metre) == (None,) * 3
+    assert not shown.heading_better
+
+
+def test_a_path_by_the_wheels_is_that_of_the_sensor() -> None:
+    piece = Piece(sensed("positions"), Base.of(DriveConfig()))
+    p = np.zeros(9)
+    p[[TRACK, AHEAD, ASIDE]] = 0.4, 0.3, -0.1
+    heading, rolled, turned, x, y = Path(piece, p).at(piece.t)
+    place, yaw = piece.base.path(p, piece.left, piece.right)
+    assert heading == pytest.approx(yaw)
+    assert x + 1j * y == pytest.approx(place + (0.3 - 0.1j) * np.exp(1j * yaw))
+    assert np.diff(rolled).min() >= 0.0
+    assert (rolled[-1], turned[-1]) == pytest.approx((7.85, 20.3), rel=0.01)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import cache
+
 import numpy as np
 import pytest
 from msgspec import structs
@@ -13,6 +15,11 @@ from acsard.core.config.settings import Config, DriveConfig, FeedbackConfig
 from tests.unit.calibration_logs import run, usual
 
 
+@cache
+def whole() -> Run:
+    return run(usual(), places=False)
+
+
 def commanded(lag: float, fastest: float = 99.0, cut: bool = False) -> Run:
     """Return a drive whose wheels follow steps of the command behind a lag."""
     t = np.arange(0, 60, 0.02)
@@ -21,12 +28,11 @@ def commanded(lag: float, fastest: float = 99.0, cut: bool = False) -> Run:
     for i in range(1, len(t)):
         limited = np.clip(wish[i] / 0.05, -fastest, fastest)
         speed[i] = speed[i - 1] + (limited - speed[i - 1]) * (0.02 / (lag + 0.02))
-    whole = run(usual(), places=False)
     angle = np.cumsum(speed) * 0.02
     kept = (t % 20 < 10) if cut else np.ones(len(t), dtype=bool)
     commands = np.column_stack((wish, np.zeros(len(t))))[kept]
     return structs.replace(
-        whole, t=t, left=angle, right=angle, commands_t=t[kept], commands=commands
+        whole(), t=t, left=angle, right=angle, commands_t=t[kept], commands=commands
     )
 
 
@@ -71,3 +77,42 @@ def test_a_log_that_shows_nothing_better_is_refused_with_its_decisions() -> None
     )  # fmt: skip
     with pytest.raises(LogError, match=r"nothing to write\.\n.* stay as configured"):
         calibrate(Log((run(trip, places=False),), ()), config, "a.csv")
+
+
+def stepped(seconds: float, lag: float = 0.4, turns: bool = False, wobble: float = 0.0) -> Run:
+    """Return steps of the command each 2 s that the wheels follow exactly, or wobble, rad/s."""
+    t = np.arange(0, seconds + 0.001, 0.02)
+    wish = np.where(t // 2 % 2 < 1, 1.0, -0.5)
+    # As configured: wheels of 0.05 m that are 0.3 m apart.
+    sides = wish / 0.05 * (np.array([-0.15, 0.15]) if turns else np.array([1.0, 1.0]))[:, None]
+    speeds = np.zeros(sides.shape)
+    for n in range(1, len(t)):
+        speeds[:, n] = speeds[:, n - 1] + (sides[:, n] - speeds[:, n - 1]) * 0.02 / (lag + 0.02)
+    angles = np.cumsum(speeds + wobble * np.sin(44 * t), axis=1) * 0.02
+    return structs.replace(
+        whole(), t=t, left=angles[0], right=angles[1], commands_t=t,
+        commands=np.column_stack((0 * wish, wish) if turns else (wish, 0 * wish)),
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("turns", [False, True])
+def test_the_lag_of_wheels_that_follow_exactly_is_found_within_a_step(turns: bool) -> None:
+    """The tried times are 11 % apart."""
+    for lag in (0.1, 0.4):
+        found = response_time([stepped(20.0, lag, turns)], DriveConfig())
+        assert found == pytest.approx(lag, rel=0.06)
+
+
+def test_a_response_time_needs_4_s_of_commands_that_explain_half_of_the_motion() -> None:
+    for seconds, shown in ((3.9, False), (4.1, True)):
+        assert (response_time([stepped(seconds)], DriveConfig()) is not None) is shown
+    for share, shown in ((0.45, True), (0.55, False)):
+        wobble = np.sqrt(2 * 245 * share / (1 - share))
+        found = response_time([stepped(20.0, 0.05, wobble=wobble)], DriveConfig())
+        assert (found is not None) is shown
+
+
+def test_a_command_counts_for_half_a_second() -> None:
+    exact = stepped(20.0, 0.4)
+    thin = structs.replace(exact, commands_t=exact.commands_t[::25], commands=exact.commands[::25])
+    assert response_time([thin], DriveConfig()) == pytest.approx(0.4, rel=0.06)

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from contextlib import nullcontext
 
 import numpy as np
 import pytest
 from msgspec import structs
 
 from acsard.calibration.log import Log, LogError, Notes, Run, read, run_of
-from acsard.calibration.result import Result, calibrate, text
+from acsard.calibration.result import Result, _require_motion, calibrate, text
 from acsard.core.config.settings import Config, DriveConfig, OdometryConfig
 from tests.unit.calibration_robots import GUIDED, Robot
 from tests.unit.calibration_robots import drive as driven
@@ -194,3 +195,25 @@ def test_a_sensor_that_is_exact_was_computed_from_the_wheels() -> None:
     copied = run_of("1", {"left right": rows, "yaw_rate": (run.t, w)}, Notes())
     assert "yaw_rate agrees with the wheels better than a sensor can" in calibrated(copied).notes[0]
     assert OdometryConfig().gyro_scale_std == 0.03  # of which the deviations above are made
+
+
+@pytest.mark.parametrize(
+    ("seconds", "fastest", "change", "robot"),
+    [
+        (1100.0, 2.0, 0.44, True),  # by 20 % of the usual speed within 1 s
+        (1100.0, 2.0, 0.36, False),
+        (1100.0, 20.0, 2.1, True),  # or by a tenth of the configured acceleration
+        (1100.0, 20.0, 1.9, False),
+        (990.0, 2.0, 0.36, True),
+        (1010.0, 2.0, 0.36, False),
+    ],
+)
+def test_the_wheels_of_a_long_log_change_their_speed_as_robots_do(
+    seconds: float, fastest: float, change: float, robot: bool
+) -> None:
+    t = np.arange(0.0, seconds, 0.5)
+    angle = fastest * fastest / change * np.sin(t * change / fastest)
+    still = np.zeros(len(t))
+    run = structs.replace(log("gyro"), t=t, left=angle, right=still + t)
+    with nullcontext() if robot else pytest.raises(LogError, match="no wheel changes by more than"):
+        _require_motion([run], Config())
