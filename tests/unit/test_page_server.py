@@ -112,6 +112,17 @@ def test_a_port_in_use_is_reported_or_the_next_port_is_used() -> None:
             assert endpoint.port > wished.port
 
 
+def test_a_name_that_no_resolver_knows_is_reported_in_the_words_of_the_system(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def unknown(*_: object, **__: object) -> None:
+        raise socket.gaierror(socket.EAI_NONAME, "Name or service not known")
+
+    monkeypatch.setattr(socket, "getaddrinfo", unknown)
+    with pytest.raises(InUseError, match="https://robot7:8443/: Name or service not known; if"):
+        open_sockets([Listen(True, "robot7", 8443)], next_port=False)
+
+
 @pytest.mark.parametrize("texts", [("0.0.0.0", "[::]"), ("[::]", "127.0.0.1")])
 def test_an_address_at_the_port_of_the_ipv6_wildcard_is_reported(
     texts: tuple[str, str],

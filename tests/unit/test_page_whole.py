@@ -20,8 +20,12 @@ from yarl import URL
 from acsard.bus.address import Address
 from acsard.bus.zenoh_sessions import MAX_MESSAGE_BYTES
 from acsard.core.config.settings import WebConfig
+from acsard.core.messages.encodings import DecodeError
+from acsard.host import clock
+from acsard.host.errors import NoAnswerError, UsageError
 from acsard.web.answers import unsent_bytes
 from acsard.web.app import Page
+from acsard.web.camera import Picture
 from acsard.web.connections import MAX_WAITING_BYTES, Connections
 from acsard.web.followed_robot import About, FollowedRobot
 from acsard.web.metrics import Counts
@@ -140,7 +144,9 @@ async def test_a_client_on_the_robot_has_the_role_of_the_configuration(tmp_path:
     whole = Whole(tmp_path, WebConfig(local="operator"))
     async with whole.hands() as ours:
         hello = (await ours.find(lambda frame: "hello" in frame))["hello"]
-        assert hello["role"] == "operator"
+        assert (hello["robot"], hello["version"], hello["role"]) == ("acsar", "1", "operator")
+        assert (hello["limits"], hello["simulated"]) == ({"linear": 1.0, "angular": 4.0}, True)
+        assert (hello["state_rate"], hello["camera"]) == (10.0, False)
         assert "set" in hello["barred"]
         assert not (await ours.call("set", settings={}))["ok"]
     assert whole.counts.refused() == {"role": 1}
@@ -378,3 +384,51 @@ async def test_a_viewer_that_drives_and_goes_away_leaves_a_zero(whole: Whole, ab
             await ours.socket.close()
         await eventually(lambda: driven.speeds[-1] == 0.0)
     assert driven.speeds == [0.0, 0.5, 0.0]
+
+
+@pytest.mark.parametrize(
+    ("error", "status", "words"),
+    [
+        (None, 503, "no daemon answers at tcp/127.0.0.1:1 yet"),
+        (NoAnswerError("nobody answers"), 504, "no daemon answers at tcp/127.0.0.1:1 yet"),
+        (UsageError("there is no such key"), 503, "there is no such key"),
+        (DecodeError("malformed", "it is not JSON"), 503, "it is not JSON"),
+        (TimeoutError(), 503, "the robot did not answer in time: try again"),
+    ],
+)
+async def test_a_value_that_the_robot_does_not_give_is_answered_with_the_reason(
+    whole: Whole, error: Exception | None, status: int, words: str
+) -> None:
+    whole.robot.client = cast(Any, error and Mock(reply=Mock(side_effect=error)))
+    async with whole.served() as (url, session), session.get(url / "api/state") as answer:
+        assert (answer.status, (await answer.json())["error"]) == (status, words)
+
+
+async def test_the_age_of_a_picture_and_the_wait_for_it_are_in_milliseconds(
+    whole: Whole, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    now_ns = 5_000_000_000
+
+    async def after(number: int) -> Picture:
+        nonlocal now_ns
+        now_ns += 300_000_000
+        return Picture(b"", number + 1, 1_000_000_000)
+
+    monkeypatch.setattr(clock, "steady_ns", lambda: now_ns)
+    whole.page._camera.after = after  # type: ignore[method-assign]
+    for tag, number in (("", "1"), ("7", "8"), ("seven", "1"), (16 * "7", "1")):
+        async with whole.served() as (url, session):
+            known = {"If-None-Match": f'"{tag}"'}
+            now_ns = 5_000_000_000
+            async with session.get(url / "api/camera", headers=known) as answer:
+                assert answer.headers["ETag"].strip('"') == number
+                times = answer.headers["Age-Ms"], answer.headers["Waited-Ms"]
+                assert times == ("4300", "300")
+
+
+async def test_a_viewer_that_goes_away_ends_its_subscriptions(whole: Whole) -> None:
+    async with whole.hands() as ours:
+        await ours.say(subscribe="odom", rate=10)
+        await eventually(lambda: whole.robot.streams._streams)
+    (stream,) = whole.robot.streams._streams.values()
+    await eventually(lambda: stream.users == 0)
