@@ -4,15 +4,19 @@ from __future__ import annotations
 
 import fcntl
 import json
+import math
 import os
 import pty
 import signal
 import struct
 import sys
 import termios
+import time
 from collections.abc import Callable
+from contextlib import nullcontext
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any, cast
 from unittest.mock import MagicMock
 
 import pytest
@@ -27,8 +31,10 @@ from acsard.core.config.settings import Config
 from acsard.core.messages import schema
 from acsard.core.simulator.fake_mcu import FakeMcu
 from acsard.core.simulator.virtual_wire import VirtualWire
+from acsard.daemon.serial.blocking import BlockingPort
+from acsard.host import clock
 from acsard.host.errors import Exit, InUseError, MendableError, NoPortError, UsageError
-from acsard.terminal.prompt import ended_by_signals
+from acsard.terminal.prompt import Prompt, ended_by_signals
 from tests.each import each
 
 
@@ -150,6 +156,78 @@ def test_a_robot_whose_file_the_check_changed_stays_switched_off(
         assert "the robot stays switched off: a stop holds it" in capsys.readouterr().err
 
 
+class Held:
+    """A port that a daemon has opened until its file is closed for the `free`-th attempt."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, free: float) -> None:
+        self.attempts = self.loans = 0
+        self._free = free
+        monkeypatch.setattr(BlockingPort, "open", lambda *_: self._open())
+
+    def begin(self, _: InUseError) -> None:
+        self.loans += 1
+
+    def _open(self) -> None:
+        self.attempts += 1
+        if self.attempts < self._free:
+            raise InUseError("in use")
+
+
+@pytest.mark.parametrize(("free", "loans"), [(1, 0), (3, 1), (math.inf, 1)])
+def test_a_lent_port_is_opened_as_soon_as_the_daemon_has_closed_it_or_not_at_all(
+    free: float, loans: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    held, now_s = Held(monkeypatch, free), 100.0
+
+    def sleep(seconds: float) -> None:
+        nonlocal now_s
+        now_s += seconds
+
+    monkeypatch.setattr(time, "sleep", sleep)
+    monkeypatch.setattr(clock, "steady_s", lambda: now_s)
+    port = BorrowedPort("/dev/none", cast(Any, held))
+    if free < math.inf:
+        port.open(115200)
+        assert (held.attempts, held.loans) == (free, loans)
+    else:
+        with pytest.raises(InUseError):
+            port.open(115200)
+        assert now_s == pytest.approx(100.0 + borrowed_port.CLOSE_TIMEOUT_S, abs=0.1)
+
+
+@pytest.mark.parametrize(
+    ("port", "pid", "lends"),
+    [("link", 77, True), ("ttyS9", 77, True), ("ttyS8", 77, False), ("link", 78, False)],
+)
+def test_only_the_daemon_that_has_the_port_lends_it_also_under_another_name(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, port: str, pid: int, lends: bool
+) -> None:
+    (tmp_path / "ttyS9").touch()
+    (tmp_path / "link").symlink_to(tmp_path / "ttyS9")
+    robot, config = MagicMock(), Config()
+    robot.__enter__.return_value = robot
+    robot.get.return_value = SimpleNamespace(pid=77, port=str(tmp_path / port))
+    robot.call.return_value = schema.ServiceReply(success=True, message="")
+    monkeypatch.setattr(borrowed_port, "answers", lambda _: True)
+    monkeypatch.setattr(borrowed_port, "is_daemon_here", lambda _: True)
+    monkeypatch.setattr(borrowed_port, "holder_of", lambda _: SimpleNamespace(pid=pid))
+    monkeypatch.setattr(borrowed_port, "open_connection", lambda _: robot)
+    own = structs.replace(config, mcu=structs.replace(config.mcu, port=str(tmp_path / "ttyS9")))
+    loan, in_use = borrowed_port.Loan(own, lambda _: None), InUseError("in use")
+    with nullcontext() if lends else pytest.raises(InUseError, match="in use"):
+        loan.begin(in_use)
+    assert robot.call.called == lends
+
+
+def test_without_json_a_check_that_cannot_go_on_prints_only_the_reason(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(NoPortError):
+        called(tmp_path, "--port", str(tmp_path / "none"), "--yes")
+    file = tmp_path / "acsard.toml"
+    assert capsys.readouterr() == (f"port {tmp_path / 'none'}, configuration {file}\n", "")
+
+
 def test_a_port_without_an_answer_is_not_written(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -192,7 +270,10 @@ def test_without_questions_only_a_speed_of_the_file_is_driven(
     (tmp_path / "acsard.toml").unlink(missing_ok=True)
     run = MagicMock()
     monkeypatch.setattr(procedure, "run", run)
+    begun = MagicMock()
+    monkeypatch.setattr(Prompt, "begin", begun)
     nothing_judged = called(tmp_path, "--port", "sim", "--yes", text=f"[limits]\n{text}\n")
+    assert "the built-in SIMULATOR" in begun.call_args.args[-1]
     assert nothing_judged == Exit.FAILURE
     assert run.call_args.kwargs == {"fast": fast}
 

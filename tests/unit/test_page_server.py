@@ -166,6 +166,19 @@ def test_an_invitation_ends_with_the_command_that_revokes_it(
     assert Vault(tmp_path / "state", "acsar").all() == []
 
 
+@pytest.mark.parametrize(
+    ("words", "hours"), [((), 30 * 24), (("--days", "3"), 3 * 24), (("--hours", "2"), 2)]
+)
+def test_an_invitation_lasts_for_the_time_that_was_typed(
+    words: tuple[str, ...], hours: int, tls: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("STATE_DIRECTORY", str(tmp_path / "state"))
+    address = ["--address", "https://0.0.0.0:8443"]
+    assert main(["web", "--tls", tls, *address, "invite", "viewer", *words]) == 0
+    (token,) = Vault(tmp_path / "state", "acsar").all()
+    assert token.ends - token.made == hours * 3600
+
+
 async def test_one_thread_waits_for_a_hanging_disk_and_then_everything_is_read_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

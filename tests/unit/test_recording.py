@@ -99,6 +99,12 @@ def test_heads_and_files_begin_after_their_times_and_each_file_replays_alone(
     assert played(paths).gaps == []
 
 
+def test_the_manual_states_how_long_a_file_is() -> None:
+    page = Path(__file__).parents[2] / "deploy/manual/pages/reference/recordings.md"
+    assert "ends after an hour" in page.read_text(encoding="utf-8")
+    assert module.FILE_NS == 3600 * NS_PER_S
+
+
 def test_a_changed_setting_is_in_the_next_head_after_20_s(bench: Bench) -> None:
     assert bench.world.call("set", b'{"settings": {"limits.linear_speed": 0.25}}').success
     bench.drive(20)

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import io
 import json
 import os
+import sys
 import time
 from functools import partial
 from pathlib import Path
@@ -11,6 +13,7 @@ from pathlib import Path
 import pytest
 from msgspec.structs import replace
 
+from acsard.cli import parser
 from acsard.core.values import Event
 from acsard.host.errors import Exit
 from acsard.host.version import version
@@ -174,3 +177,41 @@ def test_a_replay_names_another_version_that_recorded(where: Path, tmp_path: Pat
 
 def versioned(own: str, _: str, *fields: object) -> Head:
     return Head(own, *fields)  # type: ignore[arg-type]
+
+
+def test_a_recording_that_does_not_exist_is_named(where: Path, tmp_path: Path) -> None:
+    advice = "`acsard recording` lists the recordings"
+    code, _, err = log(where, "show", "7")
+    assert (code, err) == (1, f"acsard: no recording 7 in {where}; {advice}")
+    code, _, err = log(tmp_path, "show")
+    assert (code, err) == (1, f"acsard: no recording in {tmp_path}; {advice}")
+
+
+@pytest.mark.parametrize("verb", ["report", "export"])
+def test_a_file_that_cannot_be_written_ends_with_the_reason(
+    where: Path, tmp_path: Path, verb: str
+) -> None:
+    new = tmp_path / "none" / ("new.html" if verb == "report" else "new.mcap")
+    code, out, err = log(where, verb, "1", str(new))
+    assert (code, out) == (Exit.FAILURE, "")
+    assert f"cannot write {new}: No such file or directory" in err
+
+
+class Terminal(io.StringIO):
+    def isatty(self) -> bool:
+        return True
+
+
+def test_a_long_reading_shows_on_a_terminal_how_far_it_is(
+    where: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("acsard.cli.recording.PROGRESS_RECORDS", 100)
+    errors = Terminal()
+    with monkeypatch.context() as patched:
+        patched.setattr(sys, "stderr", errors)
+        args = parser(["recording"]).parse_args(["recording", "replay", str(where / name(1))])
+        assert args.main(args) == 0
+    *times, end = errors.getvalue().split("\r")[1:]
+    assert end == "\x1b[K"
+    assert 1 <= len(times) <= STEPS // 100 + 2
+    assert times[0] == local(0.0)[:19]
