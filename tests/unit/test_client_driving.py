@@ -206,7 +206,7 @@ AGAINST: list[tuple[str, Says, type[Exception], str, float, bool]] = [
      NotDrivenError, "rear_left wheel is stuck", SETTLED_S, False),
     ("switched off", after(0, replace(STOPPED, mode="inactive", reason="switched off")),
      NotDrivenError, "switched off", SETTLED_S, False),
-    ("unlisted", after(0, replace(FOLLOWED, sources=[source(name="nav")])), NotDrivenError,
+    ("unlisted", after(0, replace(FOLLOWED, sources=[source(name="nav")])), UnheardError,
      "app is not one of commands.sources: nav; add app",
      SETTLED_S, False),
     ("no link", after(0, replace(STOPPED, mode="waiting", reason="waiting for the first lines")),
@@ -230,8 +230,11 @@ def test_a_drive_that_is_not_followed_ends_with_the_reason_and_a_zero(
     name: str, responder: Says, error: type[Exception], words: str, took: float, moved: bool
 ) -> None:
     world = World(responder)
-    with pytest.raises(error, match=words):
+    with pytest.raises(error, match=words) as raised:
         world.drive(60.0)
+    assert type(raised.value) is error
+    if isinstance(raised.value, UnheardError):
+        assert raised.value.lacks_only_commands == (name == "unheard")
     assert took - 0.05 <= world.passed <= took + 0.3
     assert (0.5 in world.sent) == moved
     assert (world.sent[-1], world.subscribed) == (0.0, False)

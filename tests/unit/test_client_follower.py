@@ -13,6 +13,7 @@ from acsard.bus.subscription import MAX_QUEUED_SAMPLES
 from acsard.client.follower import (
     FIRST_STATE_TIMEOUT_S,
     FLEET_QUERY_PERIOD_S,
+    MONOTONIC_COUNTERS,
     QUERY_PERIOD_S,
     ROBOT_SILENCE_TIMEOUT_S,
     Follower,
@@ -91,6 +92,11 @@ def test_decreasing_counters_show_a_restarted_daemon() -> None:
     assert not restarted(BEFORE, STATE)
     assert restarted(STATE, BEFORE)
     assert restarted(STATE, replace(STATE, counters={}))
+    assert not restarted(replace(STATE, counters={}), STATE)
+    assert not restarted(STATE, STATE)
+    one = MONOTONIC_COUNTERS[0]
+    fewer = STATE.counters | {one: STATE.counters[one] - 1}
+    assert restarted(STATE, replace(STATE, counters=fewer))
 
 
 class Robot:

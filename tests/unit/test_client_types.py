@@ -5,6 +5,7 @@ from __future__ import annotations
 import subprocess
 import sys
 from collections.abc import Callable
+from inspect import signature
 from pathlib import Path
 from typing import Any, get_args, get_overloads, get_type_hints
 
@@ -53,6 +54,12 @@ def test_both_clients_show_the_same_few_names() -> None:
             "call", "clear", "drive", "get", "messages", "move", "name", "pose", "send", "set",
             "stop", "turn", "whoami",
         }, client  # fmt: skip
+
+
+@each("name", ["call", "clear", "drive", "move", "pose", "send", "set", "stop", "turn", "whoami"])
+def test_both_clients_have_the_same_parameters_and_defaults(name: str) -> None:
+    one, other = (signature(getattr(client, name)) for client in (Client, AsyncClient))
+    assert one.parameters == other.parameters
 
 
 STUDENT = """\
