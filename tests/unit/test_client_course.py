@@ -142,6 +142,15 @@ def test_a_move_stops_when_the_odometry_falls_silent() -> None:
     assert next(n for n, speed in enumerate(reversed(world.sent)) if speed) >= 10
 
 
+def test_a_move_does_not_begin_without_a_state_that_counts_the_poses() -> None:
+    world = WithOdometry(60.0)
+    world.published = world.answers = False
+    with pytest.raises(NoAnswerError, match="nothing received"):
+        world.move()
+    assert world.passed < 3.0
+    assert world.sent == []
+
+
 def test_a_move_of_a_robot_that_waits_for_its_board_ends_with_that_reason() -> None:
     missing = "/dev/ttyACM0 does not exist; plug the device in"
     world = WithOdometry(0.0, after(0.0, replace(STOPPED, mode="waiting", reason=missing)))

@@ -1,20 +1,30 @@
-"""How a connection ends: with its block, with its program, or not at all if it hangs."""
+"""How connections and failed drives end: with zeros, and with the reason if one hangs."""
 
 from __future__ import annotations
 
 import os
 import threading
+from collections.abc import Iterator
 from contextlib import nullcontext
 from typing import Any
 
 import pytest
 
 from acsard.bus.address import Address
-from acsard.client import AsyncClient, NoAnswerError, asynchronous, connect_async, connection
+from acsard.client import (
+    AsyncClient,
+    Client,
+    NoAnswerError,
+    asynchronous,
+    connect_async,
+    connection,
+    synchronous,
+)
 from acsard.client.connection import Connection, open_connection
+from acsard.client.driving import UnheardError
 from acsard.client.ride import MAX_SOURCE_TIMEOUT_S
 from acsard.core.values import REST, Twist
-from acsard.host.errors import UnreachableError
+from acsard.host.errors import NotDrivenError, NotPermittedError, UnreachableError
 from tests.unit.test_client_connection import Session, client_of, without_states
 
 ENDPOINT = "tcp/127.0.0.1:1"
@@ -142,3 +152,56 @@ def test_the_same_client_may_have_another_name_in_the_log() -> None:
     assert (other.session, other.where, other.sender) == (robot.session, robot.where, robot.sender)
     assert other.caller.startswith("ann@page/")
     assert not robot.caller.startswith("ann@page/")
+
+
+class Steps:
+    """A drive that fails with this error, and the driver whose zeros follow."""
+
+    def __init__(self, error: Exception, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.zeros_sent, self.is_ended = 0, False
+        self.error = error
+        for module in (asynchronous, synchronous):
+            monkeypatch.setattr(module, "Driver", lambda _: self)
+            monkeypatch.setattr(module, "drive", lambda *_: self.steps)
+
+    def steps(self, _: object) -> Iterator[float]:
+        yield 0.0
+        raise self.error
+
+    def zeros(self) -> Iterator[float]:
+        for _ in range(3):
+            self.zeros_sent += 1
+            yield 0.0
+
+    def end(self) -> None:
+        self.is_ended = True
+
+
+async def drive(robot: Client | AsyncClient) -> None:
+    if isinstance(robot, Client):
+        robot.drive(0.3, seconds=1.0)
+    else:
+        await robot.drive(0.3, seconds=1.0)
+
+
+@pytest.mark.parametrize(
+    ("error", "is_explained"),
+    [
+        (UnheardError("no command arrives", lacks_only_commands=True), True),
+        (NoAnswerError("nothing received"), True),
+        (NotDrivenError("stopped by ann"), False),
+        (KeyError("a bug"), False),
+    ],
+)
+@pytest.mark.parametrize("kind", [Client, AsyncClient])
+async def test_a_drive_that_fails_ends_with_zeros_and_the_reason_that_the_role_may_give(
+    kind: type[Client] | type[AsyncClient], error: Exception, is_explained: bool,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:  # fmt: skip
+    steps, explained = Steps(error, monkeypatch), NotPermittedError("you are a viewer")
+    robot = client_of(Session("0123456789abcdef"))
+    monkeypatch.setattr(robot, "explain_error", lambda _: explained)
+    with pytest.raises(type(explained if is_explained else error)) as raised:
+        await drive(kind(robot))
+    assert raised.value is (explained if is_explained else error)
+    assert (steps.zeros_sent, steps.is_ended) == (3, True)

@@ -20,6 +20,7 @@ from acsard.client.follower import (
     Watch,
     restarted,
 )
+from acsard.client.follower import UNREADABLE as UNREADABLE_TEXT
 from acsard.core.messages.schema import RobotState, Time
 from tests.unit.screens import BEFORE, STATE, raw_sample, sample_of
 
@@ -94,6 +95,7 @@ def test_decreasing_counters_show_a_restarted_daemon() -> None:
     assert restarted(STATE, replace(STATE, counters={}))
     assert not restarted(replace(STATE, counters={}), STATE)
     assert not restarted(STATE, STATE)
+    assert not restarted(replace(STATE, counters={}), replace(STATE, counters={}))
     one = MONOTONIC_COUNTERS[0]
     fewer = STATE.counters | {one: STATE.counters[one] - 1}
     assert restarted(STATE, replace(STATE, counters=fewer))
@@ -147,6 +149,8 @@ def test_unreadable_messages_are_counted_until_a_readable_one_and_a_flood_blocks
     robot.queue.extend([UNREADABLE] * (MAX_QUEUED_SAMPLES + 7))
     assert watch.poll(0.0) == []
     assert (watch.unreadable, len(robot.queue)) == (MAX_QUEUED_SAMPLES, 7)
+    assert watch.silence(FIRST_STATE_TIMEOUT_S + TICK) == UNREADABLE_TEXT
     robot.queue.append(sample_of(at(1)))
     watch.poll(0.0)
     assert watch.unreadable == 0
+    assert "nothing received" in watch.silence(FIRST_STATE_TIMEOUT_S + TICK)

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import json
 import os
 import socket
 import sys
 from collections import deque
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
+from unittest.mock import Mock
 
 import pytest
 import zenoh
@@ -24,6 +27,7 @@ from acsard.core.config.settings import Config, RosConfig
 from acsard.core.messages.schema import (
     Events,
     LogEvent,
+    ServiceReply,
     Time,
 )
 from acsard.core.messages.signature import public_name
@@ -33,9 +37,9 @@ from acsard.foxglove import bridge as module
 from acsard.foxglove.bridge import Bridge
 from acsard.foxglove.bridge import configuration as module_configuration
 from acsard.foxglove.relay import EventDeduplicator
-from acsard.foxglove.server import ShownTopics, start
+from acsard.foxglove.server import ShownTopics, start, stop_service
 from acsard.host import clock
-from acsard.host.errors import InUseError, NotPermittedError, ReplyError
+from acsard.host.errors import InUseError, NoAnswerError, NotPermittedError, ReplyError
 from tests.each import each
 from tests.unit.screens import raw_sample, sample_of
 
@@ -165,6 +169,31 @@ def test_a_late_viewer_of_the_log_gets_the_last_events_too(world: World) -> None
     relay.forward()
     assert len(logged) == 7
     assert b"mode3" in logged[-1]
+
+
+def test_a_topic_that_no_viewer_shows_any_more_costs_no_messages(world: World) -> None:
+    relay, ended = world.bridge._relay, list[str]()
+    for key in ("odom", "state"):
+        stream: Any = SimpleNamespace(undeclare=partial(ended.append, key))
+        relay._followed[key] = stream
+    relay.follow({full_name(world.namespace, "odom")}, set())
+    assert ended == ["state"]
+    assert list(relay._followed) == ["odom"]
+
+
+@each(("namespace", "name"), [("", "/acsard/stop"), ("robot1", "/robot1/acsard/stop")])
+@each("error", [None, NoAnswerError("nobody answers")])
+def test_the_service_that_stops_the_robot_answers_also_without_a_robot(
+    namespace: str, name: str, error: Exception | None
+) -> None:
+    robot: Any = Mock(call=Mock(return_value=ServiceReply(True, "stopped"), side_effect=error))
+    service = stop_service(robot, RosConfig(namespace=namespace))
+    assert service.name == name
+    reply = json.loads(service.handler(cast(Any, None)))
+    robot.call.assert_called_once_with("stop")
+    assert (reply["success"], reply["message"]) == (
+        (True, "stopped") if error is None else (False, "nobody answers")
+    )
 
 
 class Asked:
@@ -335,6 +364,12 @@ def test_each_event_is_reported_once(before: int, now: int) -> None:
     deduplicator.of(events(before))
     stored = range(max(before, now - 20), now)
     assert names(deduplicator, events(now)) == [f"mode{n}" for n in stored]
+
+
+def test_an_event_that_lasts_is_reported_once_although_it_counts_several_times() -> None:
+    deduplicator = EventDeduplicator()
+    deduplicator.of(events(3))
+    assert names(deduplicator, replace(events(3), stamp=Time(5), total=6)) == []
 
 
 def test_an_answer_older_than_the_last_message_reports_no_event() -> None:
