@@ -75,6 +75,19 @@ def test_each_role_may_use_the_same_keys_as_at_a_robot_s_gateway(role: Role, mes
     assert keys == granted(gateway, {role, f"certificate {role}"}, message)
 
 
+@each("message", ["reply", "declare_queryable", "liveliness_token"])
+def test_behind_a_router_no_person_answers_for_a_robot_and_a_robot_for_itself_only(
+    message: str,
+) -> None:
+    """Otherwise a viewer could show the others a pose, a state or a version of its own."""
+    access = router_config(["robot1", "robot2"])
+    for role in ROLES:
+        assert granted(access, {f"{role}s", f"certificate {role}"}, message) == set()
+    keys = granted(access, {"robot-robot1"}, message)
+    assert keys
+    assert all(key.startswith("acsard/robot1/") for key in keys)
+
+
 def test_each_of_ten_robots_has_its_own_keys_and_none_of_another_robot() -> None:
     single, ten = router_config(["robot1"]), router_config(TEN)
     assert single == read(TEMPLATE)

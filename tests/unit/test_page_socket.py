@@ -94,6 +94,14 @@ async def test_a_beat_that_arrives_while_other_values_are_sent_is_sent_once() ->
     assert [said["key"] for said in socket.sent] == ["events", "beat"]
 
 
+async def test_messages_that_a_client_does_not_read_fill_no_memory() -> None:
+    """It may ask for much, such as a pong for each ping, and read nothing."""
+    out = Outgoing(cast(Any, None), REQUEST, STREAMS, Counts(), "")
+    for number in range(1000):
+        out.enqueue(number)
+    assert [int(data) for data, _ in out._out] == list(range(800, 1000))
+
+
 async def test_a_ping_is_answered_with_the_wall_clock_in_milliseconds() -> None:
     page = Page("viewer")
     await page.take('{"ping": 12.5}')
