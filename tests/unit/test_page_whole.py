@@ -26,7 +26,7 @@ from acsard.host.errors import NoAnswerError, UsageError
 from acsard.web.answers import unsent_bytes
 from acsard.web.app import Page
 from acsard.web.camera import Picture
-from acsard.web.connections import MAX_WAITING_BYTES, Connections
+from acsard.web.connections import MAX_WAITING_BYTES, Connections, HasContext
 from acsard.web.followed_robot import About, FollowedRobot
 from acsard.web.metrics import Counts
 from acsard.web.socket_sender import MAX_UNREAD_BYTES
@@ -53,20 +53,31 @@ class Whole:
             Address("tcp/127.0.0.1:1", "acsar", ""), Mock(), ABOUT, self.counts
         )
         self.parts, self.connections = Parts(self.robot, self.counts), Connections(self.counts)
-        tokens = ReadTokens(Vault(where, "acsar"))
-        self.page = Page(self.parts, tokens, frozenset(), self.connections, rules)
+        self.vault = Vault(where, "acsar")
+        self.tokens = ReadTokens(self.vault)
+        names = frozenset({"robot.local"})
+        self.page = Page(self.parts, self.tokens, names, self.connections, rules)
 
     @asynccontextmanager
-    async def served(self) -> AsyncIterator[tuple[URL, aiohttp.ClientSession]]:
-        """Serve the page on loopback, and yield its URL and a client."""
+    async def served(
+        self, certificate: HasContext | None = None
+    ) -> AsyncIterator[tuple[URL, aiohttp.ClientSession]]:
+        """Serve the page on loopback, and yield its URL and a client.
+
+        With a certificate, the client uses HTTPS and the robot's name, like another machine.
+        """
+        scheme, headers = ("https", {"Host": "robot.local"}) if certificate else ("http", {})
         runner = web.AppRunner(self.page.app, handle_signals=False, shutdown_timeout=0.1)
         await runner.setup()
         assert runner.server is not None
         with socket.create_server(("127.0.0.1", 0)) as listening:
             listening.setblocking(False)
-            accepting = asyncio.create_task(self.connections.accept(runner.server, listening, None))
-            async with aiohttp.ClientSession() as session:
-                yield URL(f"http://127.0.0.1:{listening.getsockname()[1]}"), session
+            accepting = asyncio.create_task(
+                self.connections.accept(runner.server, listening, certificate)
+            )
+            connector = aiohttp.TCPConnector(ssl=False)
+            async with aiohttp.ClientSession(connector=connector, headers=headers) as session:
+                yield URL(f"{scheme}://127.0.0.1:{listening.getsockname()[1]}"), session
             accepting.cancel()
         await runner.cleanup()
 
