@@ -242,6 +242,14 @@ def test_a_user_who_may_not_write_the_tokens_is_told_to_use_sudo(tmp_path: Path)
         os.seteuid(0)
 
 
+def test_a_token_that_the_service_of_this_machine_does_not_read_is_named(tmp_path: Path) -> None:
+    own, service = Vault(tmp_path / "own", "acsar"), tmp_path / "service"
+    assert own.unknown_to(service) == ""
+    service.mkdir()
+    assert "run this command with sudo" in own.unknown_to(service)
+    assert Vault(service, "acsar").unknown_to(service) == ""
+
+
 @each(
     ("user", "has_service", "variables", "expected"),
     [

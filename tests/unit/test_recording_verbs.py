@@ -7,6 +7,7 @@ import json
 import os
 import sys
 import time
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
@@ -17,7 +18,7 @@ from acsard.cli import parser
 from acsard.core.values import Event
 from acsard.host.errors import Exit
 from acsard.host.version import version
-from acsard.recording.file import Head
+from acsard.recording.file import Head, first_head
 from tests.scenarios.taped import Tape
 from tests.scenarios.world import START, World
 from tests.system.typed import typed
@@ -173,6 +174,62 @@ def test_a_replay_names_another_version_that_recorded(where: Path, tmp_path: Pat
         code, out, _ = log(tmp_path, "replay", "1")
         told = f"acsard {own} recorded this, and acsard {version()} replayed it"
         assert (code, told in out) == (0, own != version())
+
+
+@pytest.mark.parametrize("verb", ["show", "replay", "report", "export"])
+def test_a_time_or_a_directory_that_cannot_be_used_is_refused(
+    where: Path, tmp_path: Path, verb: str
+) -> None:
+    new = [str(tmp_path / "new.mcap")] if verb == "export" else []
+    code, _, err = log(where, verb, "1", *new, "--from", "yesterdy")
+    assert (code, "yesterdy" in err) == (Exit.USAGE, True)
+    code, _, err = log(tmp_path / "none", verb, "1", *new)
+    assert (code, "the directory does not exist" in err) == (1, True)
+
+
+def test_the_list_names_the_recordings_that_cannot_be_read(where: Path, tmp_path: Path) -> None:
+    (tmp_path / name(1)).write_bytes((where / name(1)).read_bytes())
+    (tmp_path / name(2)).write_bytes(b"no recording")
+    for number in (3, 4):
+        (tmp_path / name(number)).touch()
+
+    def opened(path: Path) -> Head | None:
+        if path.name == name(3):
+            raise OSError(5, "Input/output error")
+        if path.name == name(4):
+            raise FileNotFoundError  # the daemon has deleted it
+        return first_head(path)
+
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr("acsard.cli.recording.first_head", opened)
+        code, out, _ = log(tmp_path)
+    rows = out.splitlines()
+    assert code == 0
+    assert [row.split()[0] for row in rows] == [name(1), name(2), name(3)]
+    assert rows[1].endswith("the beginning cannot be read")
+    assert rows[2].endswith("cannot be read: Input/output error")
+
+
+def test_a_replay_with_another_configuration_says_what_the_robot_would_have_done(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, approved: Callable[[Path, str], None]
+) -> None:
+    """The second configuration is so different that the replayed robot has a fault."""
+    monkeypatch.setattr("acsard.cli.recording.version", lambda: "0.2.0")  # of the tape
+    tape, other, text = Tape(), tmp_path / "other.toml", ""
+    world = World(recorder=tape)
+    world.drive(0.5, seconds=1.0)
+    world.run(0.5)
+    tape.save(tmp_path / name(1))
+    for settings in (
+        "[rates]\nodom = 5.0\n",
+        "[limits]\nlinear_speed = 0.3\n",
+        "[drive]\nwheel_radius = 0.12\n[limits]\nwheel_speed = 2.0\n",
+    ):
+        other.write_text(settings)
+        code, out, err = log(tmp_path, "replay", "1", "--config", str(other))
+        assert (code, err) == (0, "")
+        text += f"--- {' '.join(settings.split())}\n{out}\n"
+    approved(Path(__file__).with_name("words") / "replay.txt", text)
 
 
 def versioned(own: str, _: str, *fields: object) -> Head:
