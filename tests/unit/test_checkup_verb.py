@@ -33,7 +33,14 @@ from acsard.core.simulator.fake_mcu import FakeMcu
 from acsard.core.simulator.virtual_wire import VirtualWire
 from acsard.daemon.serial.blocking import BlockingPort
 from acsard.host import clock
-from acsard.host.errors import Exit, InUseError, MendableError, NoPortError, UsageError
+from acsard.host.errors import (
+    Exit,
+    InUseError,
+    MendableError,
+    NoAnswerError,
+    NoPortError,
+    UsageError,
+)
 from acsard.terminal.prompt import Prompt, ended_by_signals
 from tests.each import each
 
@@ -217,6 +224,48 @@ def test_only_the_daemon_that_has_the_port_lends_it_also_under_another_name(
     with nullcontext() if lends else pytest.raises(InUseError, match="in use"):
         loan.begin(in_use)
     assert robot.call.called == lends
+
+
+@pytest.mark.parametrize(
+    ("trouble", "words"),
+    [
+        ("refuses", "the daemon keeps /dev/none: a stop holds it"),
+        ("nobody", "^in use$"),
+        ("silent", "in use; the daemon did not lend it: nobody answers"),
+    ],
+)
+def test_a_port_that_the_daemon_does_not_lend_stays_in_use_with_the_reason(
+    trouble: str, words: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    robot = MagicMock()
+    robot.__enter__.return_value = robot
+    robot.__exit__.return_value = None
+    robot.get.return_value = SimpleNamespace(pid=os.getpid(), port="/dev/none")
+    robot.call.return_value = schema.ServiceReply(success=False, message="a stop holds it")
+    if trouble == "silent":
+        robot.get.side_effect = NoAnswerError("nobody answers")
+    monkeypatch.setattr(borrowed_port, "answers", lambda _: trouble != "nobody")
+    monkeypatch.setattr(borrowed_port, "is_daemon_here", lambda _: True)
+    monkeypatch.setattr(borrowed_port, "holder_of", lambda _: None)
+    monkeypatch.setattr(borrowed_port, "open_connection", lambda _: robot)
+    config, said = Config(), list[str]()
+    own = structs.replace(config, mcu=structs.replace(config.mcu, port="/dev/none"))
+    with borrowed_port.Loan(own, said.append) as loan, pytest.raises(InUseError, match=words):
+        loan.begin(InUseError("in use"))
+    assert said == []
+    assert not robot.call.called or robot.call.call_args.args == ("deactivate",)
+
+
+def test_a_daemon_that_ends_during_a_check_is_named_at_the_end(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    said = list[str]()
+    monkeypatch.setattr(
+        borrowed_port, "open_connection", MagicMock(side_effect=NoAnswerError("it has ended"))
+    )
+    with borrowed_port.Loan(Config(), said.append) as loan:
+        loan._data = schema.ReplyData(numbers=[7], loan=8)
+    assert said == ["the daemon did not take the port back (it has ended): `acsard call activate`"]
 
 
 def test_without_json_a_check_that_cannot_go_on_prints_only_the_reason(

@@ -10,6 +10,7 @@ from collections import deque
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
+from threading import Event
 from types import SimpleNamespace
 from typing import Any, cast
 from unittest.mock import Mock
@@ -41,7 +42,7 @@ from acsard.foxglove.server import ShownTopics, start, stop_service
 from acsard.host import clock
 from acsard.host.errors import InUseError, NoAnswerError, NotPermittedError, ReplyError
 from tests.each import each
-from tests.unit.screens import raw_sample, sample_of
+from tests.unit.screens import STATE, raw_sample, sample_of
 
 UNREADABLE = ReplyError("cannot read the robot's state; use the same version here")
 
@@ -169,6 +170,52 @@ def test_a_late_viewer_of_the_log_gets_the_last_events_too(world: World) -> None
     relay.forward()
     assert len(logged) == 7
     assert b"mode3" in logged[-1]
+
+
+def test_a_topic_that_a_viewer_opens_is_followed_queried_and_forwarded(
+    world: World, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    relay, queried, woken = world.bridge._relay, list[str](), list[object]()
+    queue = deque[Any]([raw_sample(b"{"), *[sample_of(STATE)] * 150, None])
+    stream: Any = SimpleNamespace(
+        try_recv=queue.popleft, put=None, wakes=woken.append, undeclare=lambda: None
+    )
+    monkeypatch.setattr(relay._robot, "subscribe", lambda key: stream)
+    monkeypatch.setattr(relay._robot, "start_query", lambda key, take: queried.append(key))
+    for key, is_queried in (("state", True), ("tf_static", False)):  # Zenoh repeats the latter
+        queried.clear()
+        logged = list[bytes]()
+        topic = full_name(world.namespace, key)
+        relay._outs[topic].channel = cast("Any", SimpleNamespace(log=logged.append))
+        relay.follow({topic}, {topic})
+        assert queried == ["state"] * is_queried
+        if key == "state":
+            relay.forward()
+            assert len(logged) == 100, "the newest of a round"
+    assert woken == [world.bridge._wake.set] * 2
+
+
+def test_a_session_that_closes_ends_no_round(world: World) -> None:
+    relay = world.bridge._relay
+    stream: Any = SimpleNamespace(try_recv=Mock(side_effect=zenoh.ZError("closed")))
+    relay._followed["odom"] = stream
+    relay.forward()
+
+
+def test_the_end_of_the_bridge_waits_for_the_server_but_not_for_ever(
+    world: World, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    released, stopped = Event(), Event()
+
+    def stop() -> None:
+        stopped.set()
+        released.wait(20.0)
+
+    world.bridge._server = cast(Any, SimpleNamespace(stop=stop))
+    monkeypatch.setattr(module, "STOP_TIMEOUT_S", 0.01)
+    world.bridge.close()
+    assert stopped.wait(20.0)
+    released.set()
 
 
 def test_a_topic_that_no_viewer_shows_any_more_costs_no_messages(world: World) -> None:
