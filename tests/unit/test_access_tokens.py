@@ -96,13 +96,15 @@ def test_a_role_and_a_field_of_a_later_version_leave_the_other_tokens_valid(tmp_
     content = json.loads(vault.path.read_bytes())
     rows = content["tokens"]
     rows[0]["later"], rows[1]["role"], content["later"] = 1, "pilot", 2
+    rows.append({"name": "later", "secret": "of another form"})
     vault.path.write_text(json.dumps(content))
     assert digests(vault) == {token.digest, other.digest}
     assert owner(vault, text) == AdmittedClient("operator", "phone", token.digest)
     assert owner(vault, pilot) is None
     vault.revoke("pilot")
     content = json.loads(vault.path.read_bytes())
-    (row,) = content["tokens"]
+    row, unknown = content["tokens"]
+    assert unknown == {"name": "later", "secret": "of another form"}
     assert (row["name"], row["later"], content["later"]) == ("phone", 1, 2)
 
 

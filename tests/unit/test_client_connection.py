@@ -115,6 +115,19 @@ def test_each_command_echoes_the_newest_beat_and_none_is_sent_before_the_first(
     assert client_of(Session("fedcba9876543210")).sender != client.sender
 
 
+def test_a_beat_that_is_not_the_robot_s_or_cannot_be_read_is_not_echoed(session: Session) -> None:
+    client = client_of(session)
+    client.send(0.0)
+    forged = SimpleNamespace(to_bytes=lambda: encode(Beat(BEAT.run, 9), "msgpack"))
+    for key, payload in (
+        ("acsard/*/beat", forged),
+        (session.beat_key, SimpleNamespace(to_bytes=lambda: b"{")),
+    ):
+        session.publish(SimpleNamespace(encoding="", payload=payload, key_expr=key))
+        client.send(0.5)
+    assert {command.echo for command in session.heard} == {Echo(BEAT.run, BEAT.boot_us * 1000)}
+
+
 def test_the_commands_of_two_threads_leave_in_their_order_and_with_the_pause(
     session: Session, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -387,6 +400,24 @@ def test_over_tls_a_service_that_the_robot_does_not_have_is_refused_with_those_t
         ours.request("danc", {})
     with pytest.raises(client.NotPermittedError):
         ours.request("dance", {})
+
+
+@each(
+    ("tls", "silence", "words"),
+    [
+        ("", "nobody is there", "^nothing received$"),
+        ("certificates", "", "^nothing received$"),
+        ("certificates", "is anna listed?", "^nothing received; is anna listed\\?$"),
+    ],
+)
+def test_the_error_of_a_silent_robot_names_the_certificate_if_that_may_be_the_reason(
+    session: Session, monkeypatch: pytest.MonkeyPatch, tls: str, silence: str, words: str
+) -> None:
+    ours = client_of(session)
+    ours.where = ours.where._replace(tls=tls)
+    monkeypatch.setattr(ours, "whoami", lambda: SimpleNamespace(silence=silence))
+    with pytest.raises(NoAnswerError, match=words):
+        raise ours.explain_error(NoAnswerError("nothing received"))
 
 
 @each(

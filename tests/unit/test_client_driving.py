@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterator
 from typing import Any
 
 import pytest
+import zenoh
 from msgspec.structs import replace
 
 from acsard.client.driving import (
@@ -238,6 +239,19 @@ def test_a_drive_that_is_not_followed_ends_with_the_reason_and_a_zero(
     assert took - 0.05 <= world.passed <= took + 0.3
     assert (0.5 in world.sent) == moved
     assert (world.sent[-1], world.subscribed) == (0.0, False)
+
+
+def test_a_drive_whose_connection_is_closed_ends_with_that_reason() -> None:
+    class Closing(World):
+        def send(self, linear: float, angular: float = 0.0) -> None:
+            super().send(linear, angular)
+            if self.passed > 0.9:
+                raise zenoh.ZError("session closed")
+
+    world = Closing(followed)
+    with pytest.raises(NoAnswerError, match="was closed while the robot was driving"):
+        world.drive(60.0)
+    assert 0.9 < world.passed < 1.0
 
 
 def test_a_stop_while_the_last_zeros_are_sent_is_named() -> None:

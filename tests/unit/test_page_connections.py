@@ -96,6 +96,26 @@ async def test_a_connection_beyond_the_limit_is_closed_and_the_next_has_the_plac
             each.close()
 
 
+async def test_a_client_that_leaves_before_it_is_accepted_ends_no_server(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Or the process may open no more files for a moment."""
+    loop = asyncio.get_running_loop()
+    accept, failures = loop.sock_accept, iter([OSError(24, "Too many open files")])
+
+    async def failing(listening: socket.socket) -> Any:
+        for error in failures:
+            raise error
+        return await accept(listening)
+
+    monkeypatch.setattr(loop, "sock_accept", failing)
+    async with asyncio.timeout(20.0), accepting(Counts()) as (host, port):
+        reader, writer = await asyncio.open_connection(host, port)
+        writer.write(b"GET / HTTP/1.1\r\nHost: localhost\r\n\r\n")
+        assert (await reader.readline()).split()[1] == b"404"
+        writer.close()
+
+
 NO_BODY = Mock(is_eof=lambda: True)
 
 

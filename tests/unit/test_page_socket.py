@@ -102,6 +102,32 @@ async def test_messages_that_a_client_does_not_read_fill_no_memory() -> None:
     assert [int(data) for data, _ in out._out] == list(range(800, 1000))
 
 
+async def test_of_two_calls_the_second_is_refused_until_the_first_is_answered() -> None:
+    page, answered = Page("maintainer"), asyncio.Event()
+
+    async def call(who: object, verb: str, payload: object) -> ServiceReply:
+        await answered.wait()
+        return ServiceReply(True, verb)
+
+    page.viewer._calls.call = call  # type: ignore[method-assign, assignment]
+    for number in (1, 2):
+        await page.take(json.dumps({"call": "clear", "id": number}))
+    await asyncio.sleep(0)
+    answered.set()
+    await wait_until(lambda: len(page.viewer._out._out) == 2)
+    said = [json.loads(text) for text, _ in page.viewer._out._out]
+    assert [(one["answer"], one["ok"]) for one in said] == [(2, False), (1, True)]
+    assert page.counts.refused() == {"too_fast": 1}
+    await page.take('{"call": "clear", "id": 3}')
+    await wait_until(lambda: len(page.viewer._out._out) == 3)
+
+
+async def test_a_ping_of_the_protocol_is_answered_with_its_data() -> None:
+    page = Page("viewer")
+    page.viewer._take(cast(Any, SimpleNamespace(type=aiohttp.WSMsgType.PING, data=b"7")))
+    assert list(page.viewer._out._out) == [(b"7", aiohttp.WSMsgType.PONG)]
+
+
 async def test_a_ping_is_answered_with_the_wall_clock_in_milliseconds() -> None:
     page = Page("viewer")
     await page.take('{"ping": 12.5}')

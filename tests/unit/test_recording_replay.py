@@ -80,6 +80,25 @@ def test_a_failure_that_cannot_be_tried_again_is_reported_with_the_reason(tmp_pa
         assert words in playback.failed_step()
 
 
+def test_a_step_on_which_this_version_fails_is_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A forged recording may have any numbers, and so may one of another version."""
+
+    def fails(*_: object) -> None:
+        raise ZeroDivisionError("division\x1b by zero")
+
+    playback = Playback(Recording([TAPE.save(tmp_path / "a")]))
+    steps = playback.steps()
+    for _ in range(7):
+        next(steps)
+    monkeypatch.setattr(playback.robot, "hear", fails)
+    words = r"replay a, which acsard 0\.2\.0 wrote: it fails with ZeroDivisionError: .* in step 7$"
+    with pytest.raises(RecordingError, match=words) as raised:
+        next(steps)
+    assert str(raised.value).isprintable()
+
+
 def test_two_paths_are_as_far_apart_as_at_their_farthest(tmp_path: Path) -> None:
     drive = replace(CONFIG.drive, wheel_radius=2 * CONFIG.drive.wheel_radius)
     recording = Recording([TAPE.save(tmp_path / "a")])
