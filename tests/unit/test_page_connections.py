@@ -55,7 +55,6 @@ async def accepting(
             yield listening.getsockname()
         finally:
             work.cancel()
-            served.close()
 
 
 async def is_open(reader: asyncio.StreamReader) -> bool:
