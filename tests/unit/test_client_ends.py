@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import os
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import nullcontext
+from functools import partial
 from typing import Any
 
 import pytest
@@ -175,6 +176,38 @@ class Steps:
 
     def end(self) -> None:
         self.is_ended = True
+
+
+@pytest.mark.parametrize("kind", [Client, AsyncClient])
+async def test_each_way_to_drive_has_its_own_steps_and_speeds(
+    kind: type[Client] | type[AsyncClient], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked = list[tuple[object, ...]]()
+    Steps(KeyError(), monkeypatch)
+
+    def steps_of(name: str, *numbers: float) -> Callable[[object], Iterator[float]]:
+        def steps(_: object) -> Iterator[float]:
+            asked.append((name, *numbers))
+            yield 0.0
+
+        return steps
+
+    for module in (asynchronous, synchronous):
+        for name in ("drive", "move", "turn"):
+            monkeypatch.setattr(module, name, partial(steps_of, name))
+    robot: Any = kind(client_of(Session("0123456789abcdef")))
+    for ask in (
+        partial(robot.drive, 0.3, 0.1, seconds=2.0), partial(robot.drive, 0.3, seconds=2.0),
+        partial(robot.move, -1.0), partial(robot.move, 1.0, speed=0.2),
+        partial(robot.turn, 90.0), partial(robot.turn, -90.0, speed=0.4),
+    ):  # fmt: skip
+        result = ask()
+        if kind is AsyncClient:
+            await result
+    assert asked == [
+        ("drive", 0.3, 0.1, 2.0), ("drive", 0.3, 0.0, 2.0), ("move", -1.0, 0.3),
+        ("move", 1.0, 0.2), ("turn", 90.0, 0.8), ("turn", -90.0, 0.4),
+    ]  # fmt: skip
 
 
 async def drive(robot: Client | AsyncClient) -> None:

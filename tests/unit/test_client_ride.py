@@ -152,6 +152,8 @@ def test_zeros_end_if_a_state_shows_that_the_sender_stopped_the_robot(
     [
         MOVING,
         replace(RESTING, angular=0.5),
+        replace(RESTING, angular=-0.5),
+        replace(RESTING, linear=-0.5),
         replace(RESTING, linear=None, angular=None),
         # The daemon has not received the commands that the network holds.
         with_age(RESTING, 0.25),
