@@ -51,4 +51,8 @@ EQUIVALENT: dict[str, str] = {
     "acsard/web/connections.py Connections.accept: 'await asyncio.sleep(0)' -> 'await asyncio.sleep(-1)'": "asyncio takes every number below 0 as 0",
     "acsard/web/followed_robot.py FollowedRobot.__init__: 'self._about_due_s, self._is_leaving = (0.0, False)' -> 'self._about_due_s, self._is_leaving = (-1.0, False)'": "the clock is above both",
     "acsard/web/socket_sender.py Following.__init__: 'self.due = 0.0' -> 'self.due = -1.0'": "the clock of the event loop is above both",
+    "acsard/client/connection.py Connection._present_causes: '._own_causes or (cause.age or 0.0) >= waited_s]' -> '._own_causes or (cause.age or -1.0) >= waited_s]'": "a query takes longer than 0 s",
+    "acsard/client/ride.py Ride.due: 'if now - self._wished > STALE_S:' -> 'if now - self._wished >= STALE_S:'": "times that are measured in ns are never equal",
+    "acsard/client/driving.py _course.steps: 'elif now - nearer > COURSE_TIMEOUT_S:' -> 'elif now - nearer >= COURSE_TIMEOUT_S:'": "times that are measured in ns are never equal",
+    "acsard/client/driving.py Driver.require: 'if state is None or ride.ended != ride.objection o' -> 'if ride.ended != ride.objection o'": "without a state there is no objection, which differs from each reason",
 }

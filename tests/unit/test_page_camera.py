@@ -13,6 +13,7 @@ from aiohttp import StreamReader
 from acsard.core.values import NS_PER_S
 from acsard.host import clock
 from acsard.web import camera as module
+from acsard.web.answers import TroubleError
 from acsard.web.camera import STREAM_ERRORS, Camera, pictures
 from tests.each import each
 
@@ -114,6 +115,21 @@ async def test_a_camera_that_nobody_asks_for_is_read_no_more(
     assert read == 7  # the sixth one came 5 s after the last request
     assert camera.newest is not None
     assert camera.newest.body == bytes(6)
+
+
+@pytest.mark.parametrize(
+    ("error", "detail"), [(TimeoutError(), "no answer"), (OSError("no route"), "no route")]
+)
+async def test_a_camera_that_does_not_answer_is_explained(
+    monkeypatch: pytest.MonkeyPatch, error: Exception, detail: str
+) -> None:
+    monkeypatch.setattr(module, "PICTURE_TIMEOUT_S", 0.05)
+    camera = Camera("http://127.0.0.1:9/")
+    monkeypatch.setattr(camera, "_read", Mock(side_effect=error))
+    with pytest.raises(TroubleError) as raised:
+        await camera.after(0)
+    camera.close()
+    assert (raised.value.status, raised.value.detail) == (503, detail)
 
 
 async def test_a_picture_that_a_server_repeats_is_not_new(monkeypatch: pytest.MonkeyPatch) -> None:
