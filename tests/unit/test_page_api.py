@@ -33,7 +33,11 @@ def test_every_key_that_answers_and_every_service_is_described() -> None:
         path = f"/api/{topic.key.replace('<Type>', '{type}')}"
         assert (path in paths and "get" in paths[path]) == is_queryable(topic), path
     assert all("post" in paths[f"/api/srv/{verb}"] for verb in SERVICES)
-    assert "requestBody" in paths["/api/srv/set"]["post"]
+    bodies = {verb: paths[f"/api/srv/{verb}"]["post"].get("requestBody") for verb in SERVICES}
+    assert bodies["stop"] is None
+    needed = {verb: body["required"] for verb, body in bodies.items() if body is not None}
+    assert (needed["set"], needed["set_pose"], needed["clear"]) == (True, True, False)
+    assert paths["/token"]["post"]["requestBody"]["required"] is True
 
 
 @pytest.mark.slow

@@ -126,7 +126,11 @@ async def test_a_link_becomes_a_cookie_that_replaces_no_greater_one_unasked(
         assert 86_000 < int(cookie["max-age"]) <= 86_400
         assert (await sign_in("viewer", had="operator"))[:2] == (409, None)
         assert (await sign_in("viewer", had="operator", replace=True))[0] == 303
+        assert (await sign_in("operator", had="operator"))[0] == 303
         assert (await sign_in("maintainer", had="operator"))[0] == 303
+        away.whole.vault.revoke("operator")
+        away.whole.tokens.read()
+        assert (await sign_in("viewer", had="operator"))[0] == 303
         # The cookie is a token of the robot's own page.
         for headers, status in (({}, 200), ({"Origin": "https://evil.example"}, 403)):
             cookies = {"Cookie": f"{name}={away.texts['viewer']}"}

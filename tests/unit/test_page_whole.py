@@ -269,6 +269,30 @@ async def test_a_path_called_with_another_method_names_the_method_it_accepts(who
             assert (await answer.json())["error"] == "this path accepts only POST"
         async with session.post(url / "api/nothing") as answer:
             assert answer.status == 404
+        async with session.post(url / "api/srv/set", data=bytes(MAX_MESSAGE_BYTES + 1)) as answer:
+            assert answer.status == 413
+        assert whole.counts.refused() == {"path": 2, "too_big": 1}
+
+
+@pytest.mark.parametrize(
+    ("sent", "reason", "words"),
+    [
+        (b"GET / HTTP/1.1\r\n\r\n", "host", b"which must name the robot"),
+        (b"\x16\x03\x01\x02\r\n\r\n", "malformed", b"bytes that are not an HTTP request"),
+    ],
+)
+async def test_bytes_that_are_no_request_are_answered_counted_and_end_the_connection(
+    whole: Whole, sent: bytes, reason: str, words: bytes
+) -> None:
+    async with whole.served() as (url, _), asyncio.timeout(PATIENCE_S):
+        reader, writer = await asyncio.open_connection(url.host, url.port)
+        writer.write(sent)
+        answer = await reader.read()
+        assert answer.split()[1] == b"400"
+        assert words in answer
+        assert b"X-Content-Type-Options: nosniff" in answer
+        assert whole.counts.refused() == {reason: 1}
+        writer.close()
 
 
 async def test_an_ordinary_request_for_the_websocket_is_told_what_the_address_is(
