@@ -55,4 +55,6 @@ EQUIVALENT: dict[str, str] = {
     "acsard/client/ride.py Ride.due: 'if now - self._wished > STALE_S:' -> 'if now - self._wished >= STALE_S:'": "times that are measured in ns are never equal",
     "acsard/client/driving.py _course.steps: 'elif now - nearer > COURSE_TIMEOUT_S:' -> 'elif now - nearer >= COURSE_TIMEOUT_S:'": "times that are measured in ns are never equal",
     "acsard/client/driving.py Driver.require: 'if state is None or ride.ended != ride.objection o' -> 'if ride.ended != ride.objection o'": "without a state there is no objection, which differs from each reason",
+    "acsard/cli/ports.py main: 'port = likely[0]' -> 'port = likely[-1]'": "its length is 1",
+    "acsard/web/answers.py unsent_bytes: 'return 0' -> 'return -1'": "it is compared with numbers from 0 on",
 }
