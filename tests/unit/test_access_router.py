@@ -24,6 +24,7 @@ from acsard.core.values import ROLES, Role
 from acsard.host.errors import CertificateError, ExitError, UsageError
 from acsard.machine.router_file import router_file
 from tests.each import each
+from tests.system.typed import typed
 from tests.unit.test_access_tls import BROKEN, make_certificates
 
 TEMPLATE = (Path(__file__).resolve().parents[2] / "deploy" / "zenoh" / "router.json5").read_text()
@@ -117,6 +118,14 @@ def test_each_of_ten_robots_has_its_own_keys_and_none_of_another_robot() -> None
             {rule.replace("robot1", robot) for rule in named for robot in TEN}
             | set(before) - set(named)
         )
+
+
+def test_the_file_of_a_router_is_printed_for_the_typed_robots_and_people() -> None:
+    ended = typed("tls", "router", "robot1", "robot2", "--operator", "laptop-anna")
+    assert ended.code == 0
+    expected = router_file(TEMPLATE, ["robot1", "robot2"], {"operator": ["laptop-anna"]})
+    assert ended.out == expected.rstrip("\n")
+    assert typed("tls", "router", "robot 1").code == 2
 
 
 @pytest.mark.parametrize("robots", [["a-1"], ["operator-1", "robot1", "x"]])

@@ -146,6 +146,9 @@ def test_a_late_viewer_gets_the_last_message_of_a_rare_key(
     out.channel = cast("Any", SimpleNamespace(log=logged.append))
     relay.follow({topic}, set())
     assert logged == []
+    relay.follow({topic}, {topic, "/topic_of_an_earlier_namespace"})
+    assert logged == [b"the last one"] * again
+    out.last = None  # nothing has arrived yet
     relay.follow({topic}, {topic})
     assert logged == [b"the last one"] * again
 
@@ -361,6 +364,8 @@ def test_the_configuration_is_read_again_if_the_daemon_restarts_meanwhile(
 
 def test_a_viewer_that_comes_while_the_daemon_is_gone_is_told(world: World) -> None:
     rounds: list[Any] = []
+    forwarded = list[bool]()
+    world.bridge._relay.forward = lambda: forwarded.append(True)  # type: ignore[method-assign]
     channel = cast(Any, SimpleNamespace(topic="/odom"))
     world.bridge._relay.follow = lambda *topics: rounds.append(topics)  # type: ignore[method-assign]
     for number, shown in ((1, []), (2, [GONE, GONE])):
@@ -371,6 +376,24 @@ def test_a_viewer_that_comes_while_the_daemon_is_gone_is_told(world: World) -> N
         world.passes(1.0)
     assert [fresh for _, fresh in rounds if fresh] == [{"/odom"}] * 2
     assert all(topics == {"/odom"} for topics, _ in rounds)
+    assert len(forwarded) == len(rounds)
+
+
+def test_the_bridge_makes_rounds_until_its_end(world: World) -> None:
+    rounds = 0
+
+    def make_round() -> None:
+        nonlocal rounds
+        rounds += 1
+        if rounds < 3:
+            world.bridge._wake.set()
+        else:
+            world.bridge.end()
+
+    world.bridge._round = make_round  # type: ignore[method-assign]
+    world.bridge._wake.set()
+    world.bridge.run()
+    assert rounds == 3
 
 
 @pytest.mark.timeout(20)

@@ -203,6 +203,16 @@ def test_every_event_has_a_row_with_the_client_that_caused_it() -> None:
     assert any("(by unnamed (native))" in word for word in words)
     marks = [mark for level in LEVELS for mark in traces(text, level) if "yaxis" in mark]
     assert sum(len(mark["x"]) for mark in marks) == len(logs)
+    told = marks[0]["yaxis"].replace("y", "yaxis")
+    axis = pictures(text)["time"]["layout"][told]
+    assert (axis["categoryarray"], axis["range"]) == ([*LEVELS], [len(LEVELS) - 0.5, -0.5])
+
+
+def test_the_name_of_an_event_is_in_words() -> None:
+    text = report([event("it rolls", "wheel_fault")], "acsar", [])
+    (mark,) = [mark for mark in traces(text, "info") if mark["x"]]
+    assert "wheel fault" in mark["hovertext"][0]
+    assert "wheel fault" in PageElements(text).words
 
 
 def test_of_too_many_events_the_newest_are_shown_and_those_of_several_days_have_a_date() -> None:
