@@ -57,4 +57,7 @@ EQUIVALENT: dict[str, str] = {
     "acsard/client/driving.py Driver.require: 'if state is None or ride.ended != ride.objection o' -> 'if ride.ended != ride.objection o'": "without a state there is no objection, which differs from each reason",
     "acsard/cli/ports.py main: 'port = likely[0]' -> 'port = likely[-1]'": "its length is 1",
     "acsard/web/answers.py unsent_bytes: 'return 0' -> 'return -1'": "it is compared with numbers from 0 on",
+    "acsard/foxglove/relay.py Relay.__init__: 'self._deduplicator = EventDeduplicator()' -> 'pass'": "the first viewer of the log gets a new one",
+    "acsard/foxglove/relay.py Relay.__init__: \"self._log_topic = ''\" -> 'pass'": "`offer` sets it before a viewer can come",
+    "acsard/client/driving.py repeat_zeros: 'if idle_s > GRACE_S:' -> 'if idle_s >= GRACE_S:'": "times that are measured in ns are never equal",
 }

@@ -35,8 +35,13 @@ ENDPOINT = "tcp/127.0.0.1:1"
 def session(monkeypatch: pytest.MonkeyPatch) -> Session:
     """Return the session that each connection of the test gets."""
     session = Session("0123456789abcdef")
+
+    def opened(endpoint: str, tls: str) -> Session:
+        assert (endpoint, tls) == (ENDPOINT, "")
+        return session
+
     for module in (asynchronous, connection):
-        monkeypatch.setattr(module, "client_session", lambda *_: session)
+        monkeypatch.setattr(module, "client_session", opened)
     monkeypatch.setattr("acsard.client.driving.MAX_END_S", 0.0)
     monkeypatch.setattr(connection, "_open", {})
     return session
