@@ -11,7 +11,6 @@ EQUIVALENT: dict[str, str] = {
     "acsard/core/motion/limits.py _approach: 'slope = slope if slope * wanted > 0 else 0.0' -> 'slope = slope if slope * wanted >= 0 else 0.0'": "where the product is 0 the slope is",
     "acsard/core/guard.py Memory: 'ramp_ns: Ns = 0' -> 'ramp_ns: Ns = -1'": "a guard without a last line takes the ramps of its limits",
     "acsard/core/guard.py Memory: 'stop_ramp_ns: Ns = 0' -> 'stop_ramp_ns: Ns = -1'": "a guard without a last line takes the ramps of its limits",
-    "acsard/core/link/codec.py Codec.wheels: 'wheel[index] = motor * sign' -> 'wheel[index] = motor / sign'": "the sign is 1 or -1",
     "acsard/machine/versions.py same: 'return files[0] == files[1] and all((cmp(one / name, other / name, shallow=False) for name in files[0]))' -> 'return files[0] == files[1] and all((cmp(other / name, one / name, shallow=False) for name in files[0]))'": "the comparison of two files is symmetric",
     "acsard/machine/upgrade.py Look.missed_fraction: \"return counters.get('missed_periods', 0) / max(1, counters.get('lines_sent', 0))\" -> \"return counters.get('missed_periods', -1) / max(1, counters.get('lines_sent', 0))\"": "it is compared with a positive bound",
     "acsard/machine/upgrade.py Look.missed_fraction: \"return counters.get('missed_periods', 0) / max(1, counters.get('lines_sent', 0))\" -> \"return counters.get('missed_periods', 0) / max(2, counters.get('lines_sent', 0))\"": "a daemon that answers has sent more than two lines",
