@@ -295,8 +295,6 @@ def _chosen(args: argparse.Namespace) -> list[Path]:
     if not files:
         which = "recording" if name is None else f"recording {name}"
         raise MendableError(f"no {which} in {where}; `acsard recording` lists the recordings")
-    if name is not None:
-        return files
     if args.begin is not None or args.end is not None:
         return [path for path in files if _may_overlap(path, *_range(args))] or files[-1:]
     if len(files) > 1:

@@ -188,7 +188,7 @@ class Silence:
             return
         reason = _none_yet(self._robot, self._key) if self._key else _ceased(self._robot)
         if reason:
-            print(f"acsard: {printable(reason)}", file=sys.stderr, flush=True)
+            print(f"acsard: {printable(reason)}", file=sys.stderr)
             self._said = True
 
 

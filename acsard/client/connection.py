@@ -494,7 +494,7 @@ class Connection(Reads):
             return NoAnswerError(f"{error}; {us.silence}")
         if isinstance(error, NoAnswerError):
             return error
-        if us.role and not has(us.role, COMMAND_ROLE):
+        if not has(us.role, COMMAND_ROLE):
             return NotPermittedError(us.describe())
         # The role may explain why no command arrives, but not a fault or a stop.
         explains = error.lacks_only_commands

@@ -10,6 +10,7 @@ import asyncio
 import base64
 import gzip
 import hashlib
+from contextlib import suppress
 from pathlib import Path
 
 import msgspec
@@ -91,27 +92,19 @@ def cut(transport: asyncio.BaseTransport | None) -> None:
     On Python 3.11.2, a TLS connection that was closed twice ends only at the time limit of its TLS
     shutdown.
     """
-    if transport is None:
-        return
-    try:
-        transport.abort()  # type: ignore[attr-defined]
-    except AttributeError:
-        # After a second close, the transport has lost its TLS protocol. Python 3.11.2 then raises
-        # this error. Later versions do nothing.
-        if not transport.is_closing():
-            raise
+    # After a second close, the transport has lost its TLS protocol. Python 3.11.2 then raises this
+    # error. Later versions do nothing.
+    with suppress(AttributeError):
+        if transport is not None:
+            transport.abort()  # type: ignore[attr-defined]
 
 
 def unsent_bytes(transport: asyncio.BaseTransport | None) -> int:
     """Return how many bytes wait for the client; 0 for a TLS connection that was closed twice."""
-    if transport is None:
-        return 0
-    try:
-        return int(transport.get_write_buffer_size())  # type: ignore[attr-defined]
-    except AttributeError:  # as in `cut`, on all versions of Python
-        if not transport.is_closing():
-            raise
-        return 0
+    with suppress(AttributeError):  # as in `cut`, on all versions of Python
+        if transport is not None:
+            return int(transport.get_write_buffer_size())  # type: ignore[attr-defined]
+    return 0
 
 
 async def secured(request: web.Request, response: web.StreamResponse) -> None:

@@ -115,12 +115,6 @@ class Connections:
                 self.counts.refuse("crowded", peer)
                 accepted.close()
 
-    def close(self) -> None:
-        """End the connections that are not open yet."""
-        for connection in self._all:
-            if connection.opening is not None:
-                connection.opening.cancel()
-
     def claim(self, connection: HttpConnection, token: str) -> bool:
         """Count a connection for the token of its request.
 
@@ -216,7 +210,7 @@ class HttpConnection(web.RequestHandler):
         )
         self.peer, self.places = peer, places
         self.token = ""  # digest of the token for which this connection counts
-        self.opening: asyncio.Task[None] | None = None
+        self.opening: asyncio.Task[None] | None = None  # a reference: asyncio keeps none
         # Ends the connection for a reason, which a WebSocket sends to its client.
         self.end: Callable[[str], None] = lambda why: self.cut()
         self._connections = connections

@@ -98,7 +98,6 @@ async def serve(
             stack.callback(opened.close)
             tls = certificate if address.secure else None
             work.append(connections.accept(runner.server, opened, tls))
-        stack.callback(connections.close)
         announce([address for address, _ in places])
         await first_ended(work, parts.outbox)
         page.end_all("the page's server ends")

@@ -189,7 +189,7 @@ def judge(path: Path, whole: list[int], frames: int = 1) -> None:
     assert len(lost) <= frames * len(whole) * (FRAME_S + 1.0) / SECONDS * 1.2
 
 
-@pytest.mark.variations(4)
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(4))
 def test_damage_costs_one_frame(seed: int, long: Path, whole: list[int], tmp_path: Path) -> None:
     dice, data = random.Random(seed), bytearray(long.read_bytes())

@@ -129,23 +129,6 @@ def test_a_separate_simulator_process_is_driven_through_the_printed_port(tmp_pat
     assert not (tmp_path / "mcu").is_symlink()
 
 
-@pytest.mark.slow
-def test_a_simulator_does_not_remove_the_link_of_the_one_that_replaced_it(tmp_path: Path) -> None:
-    link = tmp_path / "mcu"
-    with Program(acsard("sim", "--link", "mcu"), tmp_path) as first:
-        first.says("acsard run --port mcu")
-        before = os.readlink(link)
-        with Program(acsard("sim", "--link", "mcu"), tmp_path) as second:
-            second.says("acsard run --port mcu")
-            assert f"no longer to {before}" in second.stderr
-            first.signal(signal.SIGINT)
-            assert first.ended(3.0) == 0
-            assert os.readlink(link) != before
-            second.signal(signal.SIGINT)
-            assert second.ended(3.0) == 0
-    assert not link.is_symlink()
-
-
 JOINTS = [f"{wheel}_wheel_joint" for wheel in (*WHEELS, *TWO)]
 
 

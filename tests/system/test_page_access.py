@@ -11,7 +11,6 @@ import aiohttp
 import pytest
 
 from acsard.bus.tls_files import peer_ends_ns
-from acsard.core.values import ROLES, Role
 from acsard.machine.authority import Authority
 from acsard.web.page_server import TICK_S
 from tests.system.browser import NAME, Page, hands
@@ -95,30 +94,6 @@ async def test_a_token_becomes_a_cookie_that_no_script_reads_and_ends_when_revok
     assert "lent" not in page.tokens("tokens")
     until(lambda: re.search(r"\d bad token.* from 127\.0\.0\.1", page.stderr), 10.0, "a log line")
     assert token not in page.stdout + page.stderr
-
-
-async def test_a_link_with_fewer_permissions_replaces_a_cookie_only_if_asked_to(page: Page) -> None:
-    token = {role: page.invite(role, f"my-{role}") for role in ROLES}
-    async with page.client() as phone:
-
-        async def opens(role: Role, replace: bool = False) -> tuple[int, str]:
-            """Return the status and whose cookie the browser has then."""
-            form = {"token": token[role], "replace": replace}
-            url = f"{page.away}/token"
-            async with phone.post(url, json=form, allow_redirects=False) as answer:
-                status, body = answer.status, await answer.text()
-            assert status == 303 or "already signed in as my-operator (operator)" in body
-            async with phone.get(f"{page.away}/api/whoami") as answer:
-                return status, (await answer.json())["role"]
-
-        assert await opens("operator") == (303, "operator")
-        assert await opens("viewer") == (409, "operator")
-        assert await opens("operator") == (303, "operator")
-        assert await opens("maintainer") == (303, "maintainer")
-        assert await opens("operator", replace=True) == (303, "operator")
-        assert await opens("viewer", replace=True) == (303, "viewer")
-        page.vault.revoke("my-viewer")
-        assert await opens("operator") == (303, "operator")
 
 
 async def test_a_driver_whose_token_is_revoked_learns_why_within_a_second_and_the_robot_stops(

@@ -24,6 +24,7 @@ from acsard.core.values import ROLES, Role
 from acsard.host.errors import CertificateError, ExitError, UsageError
 from acsard.machine.router_file import router_file
 from tests.each import each
+from tests.system.typed import typed
 from tests.unit.test_access_tls import BROKEN, make_certificates
 
 TEMPLATE = (Path(__file__).resolve().parents[2] / "deploy" / "zenoh" / "router.json5").read_text()
@@ -75,6 +76,19 @@ def test_each_role_may_use_the_same_keys_as_at_a_robot_s_gateway(role: Role, mes
     assert keys == granted(gateway, {role, f"certificate {role}"}, message)
 
 
+@each("message", ["reply", "declare_queryable", "liveliness_token"])
+def test_behind_a_router_no_person_answers_for_a_robot_and_a_robot_for_itself_only(
+    message: str,
+) -> None:
+    """Otherwise a viewer could show the others a pose, a state or a version of its own."""
+    access = router_config(["robot1", "robot2"])
+    for role in ROLES:
+        assert granted(access, {f"{role}s", f"certificate {role}"}, message) == set()
+    keys = granted(access, {"robot-robot1"}, message)
+    assert keys
+    assert all(key.startswith("acsard/robot1/") for key in keys)
+
+
 def test_each_of_ten_robots_has_its_own_keys_and_none_of_another_robot() -> None:
     single, ten = router_config(["robot1"]), router_config(TEN)
     assert single == read(TEMPLATE)
@@ -104,6 +118,14 @@ def test_each_of_ten_robots_has_its_own_keys_and_none_of_another_robot() -> None
             {rule.replace("robot1", robot) for rule in named for robot in TEN}
             | set(before) - set(named)
         )
+
+
+def test_the_file_of_a_router_is_printed_for_the_typed_robots_and_people() -> None:
+    ended = typed("tls", "router", "robot1", "robot2", "--operator", "laptop-anna")
+    assert ended.code == 0
+    expected = router_file(TEMPLATE, ["robot1", "robot2"], {"operator": ["laptop-anna"]})
+    assert ended.out == expected.rstrip("\n")
+    assert typed("tls", "router", "robot 1").code == 2
 
 
 @pytest.mark.parametrize("robots", [["a-1"], ["operator-1", "robot1", "x"]])

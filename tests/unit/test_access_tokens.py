@@ -19,6 +19,7 @@ from acsard.machine.authority import Authority
 from acsard.web import tokens
 from acsard.web.callers import AdmittedClient
 from acsard.web.tokens import ReadTokens, Vault
+from tests.each import each
 
 
 def owner(vault: Vault, text: str) -> AdmittedClient | None:
@@ -95,13 +96,15 @@ def test_a_role_and_a_field_of_a_later_version_leave_the_other_tokens_valid(tmp_
     content = json.loads(vault.path.read_bytes())
     rows = content["tokens"]
     rows[0]["later"], rows[1]["role"], content["later"] = 1, "pilot", 2
+    rows.append({"name": "later", "secret": "of another form"})
     vault.path.write_text(json.dumps(content))
     assert digests(vault) == {token.digest, other.digest}
     assert owner(vault, text) == AdmittedClient("operator", "phone", token.digest)
     assert owner(vault, pilot) is None
     vault.revoke("pilot")
     content = json.loads(vault.path.read_bytes())
-    (row,) = content["tokens"]
+    row, unknown = content["tokens"]
+    assert unknown == {"name": "later", "secret": "of another form"}
     assert (row["name"], row["later"], content["later"]) == ("phone", 1, 2)
 
 
@@ -239,3 +242,39 @@ def test_a_user_who_may_not_write_the_tokens_is_told_to_use_sudo(tmp_path: Path)
             Vault(tmp_path / "state", "acsar").invite("viewer", "tv", 1)
     finally:
         os.seteuid(0)
+
+
+def test_a_token_that_the_service_of_this_machine_does_not_read_is_named(tmp_path: Path) -> None:
+    own, service = Vault(tmp_path / "own", "acsar"), tmp_path / "service"
+    assert own.unknown_to(service) == ""
+    service.mkdir()
+    assert "run this command with sudo" in own.unknown_to(service)
+    assert Vault(service, "acsar").unknown_to(service) == ""
+
+
+@each(
+    ("user", "has_service", "variables", "expected"),
+    [
+        (0, True, {}, "service"),
+        (0, False, {}, "home/.local/state/acsard-web"),
+        (1000, True, {}, "home/.local/state/acsard-web"),
+        (1000, False, {"XDG_STATE_HOME": "data"}, "data/acsard-web"),
+        (0, True, {"STATE_DIRECTORY": "of/unit:second"}, "of/unit"),
+    ],
+)
+def test_tokens_are_those_of_the_service_for_root_and_else_of_the_user(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+    user: int, has_service: bool, variables: dict[str, str], expected: str,
+) -> None:  # fmt: skip
+    monkeypatch.setattr(os, "geteuid", lambda: user)
+    monkeypatch.setattr(tokens, "SERVICE_DIRECTORY", tmp_path / "service")
+    monkeypatch.setattr(Path, "home", lambda: tmp_path / "home")
+    for name in ("STATE_DIRECTORY", "XDG_STATE_HOME"):
+        monkeypatch.delenv(name, raising=False)
+    for name, value in variables.items():
+        monkeypatch.setenv(name, ":".join(str(tmp_path / part) for part in value.split(":")))
+    if has_service:
+        (tmp_path / "service").mkdir(exist_ok=True)
+    elif (tmp_path / "service").exists():
+        (tmp_path / "service").rmdir()
+    assert tokens.place() == tmp_path / expected

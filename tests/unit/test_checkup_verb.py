@@ -4,15 +4,19 @@ from __future__ import annotations
 
 import fcntl
 import json
+import math
 import os
 import pty
 import signal
 import struct
 import sys
 import termios
+import time
 from collections.abc import Callable
+from contextlib import nullcontext
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any, cast
 from unittest.mock import MagicMock
 
 import pytest
@@ -27,8 +31,17 @@ from acsard.core.config.settings import Config
 from acsard.core.messages import schema
 from acsard.core.simulator.fake_mcu import FakeMcu
 from acsard.core.simulator.virtual_wire import VirtualWire
-from acsard.host.errors import Exit, InUseError, MendableError, NoPortError, UsageError
-from acsard.terminal.prompt import ended_by_signals
+from acsard.daemon.serial.blocking import BlockingPort
+from acsard.host import clock
+from acsard.host.errors import (
+    Exit,
+    InUseError,
+    MendableError,
+    NoAnswerError,
+    NoPortError,
+    UsageError,
+)
+from acsard.terminal.prompt import Prompt, ended_by_signals
 from tests.each import each
 
 
@@ -150,6 +163,120 @@ def test_a_robot_whose_file_the_check_changed_stays_switched_off(
         assert "the robot stays switched off: a stop holds it" in capsys.readouterr().err
 
 
+class Held:
+    """A port that a daemon has opened until its file is closed for the `free`-th attempt."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, free: float) -> None:
+        self.attempts = self.loans = 0
+        self._free = free
+        monkeypatch.setattr(BlockingPort, "open", lambda *_: self._open())
+
+    def begin(self, _: InUseError) -> None:
+        self.loans += 1
+
+    def _open(self) -> None:
+        self.attempts += 1
+        if self.attempts < self._free:
+            raise InUseError("in use")
+
+
+@pytest.mark.parametrize(("free", "loans"), [(1, 0), (3, 1), (math.inf, 1)])
+def test_a_lent_port_is_opened_as_soon_as_the_daemon_has_closed_it_or_not_at_all(
+    free: float, loans: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    held, now_s = Held(monkeypatch, free), 100.0
+
+    def sleep(seconds: float) -> None:
+        nonlocal now_s
+        now_s += seconds
+
+    monkeypatch.setattr(time, "sleep", sleep)
+    monkeypatch.setattr(clock, "steady_s", lambda: now_s)
+    port = BorrowedPort("/dev/none", cast(Any, held))
+    if free < math.inf:
+        port.open(115200)
+        assert (held.attempts, held.loans) == (free, loans)
+    else:
+        with pytest.raises(InUseError):
+            port.open(115200)
+        assert now_s == pytest.approx(100.0 + borrowed_port.CLOSE_TIMEOUT_S, abs=0.1)
+
+
+@pytest.mark.parametrize(
+    ("port", "pid", "lends"),
+    [("link", 77, True), ("ttyS9", 77, True), ("ttyS8", 77, False), ("link", 78, False)],
+)
+def test_only_the_daemon_that_has_the_port_lends_it_also_under_another_name(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, port: str, pid: int, lends: bool
+) -> None:
+    (tmp_path / "ttyS9").touch()
+    (tmp_path / "link").symlink_to(tmp_path / "ttyS9")
+    robot, config = MagicMock(), Config()
+    robot.__enter__.return_value = robot
+    robot.get.return_value = SimpleNamespace(pid=77, port=str(tmp_path / port))
+    robot.call.return_value = schema.ServiceReply(success=True, message="")
+    monkeypatch.setattr(borrowed_port, "answers", lambda _: True)
+    monkeypatch.setattr(borrowed_port, "is_daemon_here", lambda _: True)
+    monkeypatch.setattr(borrowed_port, "holder_of", lambda _: SimpleNamespace(pid=pid))
+    monkeypatch.setattr(borrowed_port, "open_connection", lambda _: robot)
+    own = structs.replace(config, mcu=structs.replace(config.mcu, port=str(tmp_path / "ttyS9")))
+    loan, in_use = borrowed_port.Loan(own, lambda _: None), InUseError("in use")
+    with nullcontext() if lends else pytest.raises(InUseError, match="in use"):
+        loan.begin(in_use)
+    assert robot.call.called == lends
+
+
+@pytest.mark.parametrize(
+    ("trouble", "words"),
+    [
+        ("refuses", "the daemon keeps /dev/none: a stop holds it"),
+        ("nobody", "^in use$"),
+        ("silent", "in use; the daemon did not lend it: nobody answers"),
+    ],
+)
+def test_a_port_that_the_daemon_does_not_lend_stays_in_use_with_the_reason(
+    trouble: str, words: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    robot = MagicMock()
+    robot.__enter__.return_value = robot
+    robot.__exit__.return_value = None
+    robot.get.return_value = SimpleNamespace(pid=os.getpid(), port="/dev/none")
+    robot.call.return_value = schema.ServiceReply(success=False, message="a stop holds it")
+    if trouble == "silent":
+        robot.get.side_effect = NoAnswerError("nobody answers")
+    monkeypatch.setattr(borrowed_port, "answers", lambda _: trouble != "nobody")
+    monkeypatch.setattr(borrowed_port, "is_daemon_here", lambda _: True)
+    monkeypatch.setattr(borrowed_port, "holder_of", lambda _: None)
+    monkeypatch.setattr(borrowed_port, "open_connection", lambda _: robot)
+    config, said = Config(), list[str]()
+    own = structs.replace(config, mcu=structs.replace(config.mcu, port="/dev/none"))
+    with borrowed_port.Loan(own, said.append) as loan, pytest.raises(InUseError, match=words):
+        loan.begin(InUseError("in use"))
+    assert said == []
+    assert not robot.call.called or robot.call.call_args.args == ("deactivate",)
+
+
+def test_a_daemon_that_ends_during_a_check_is_named_at_the_end(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    said = list[str]()
+    monkeypatch.setattr(
+        borrowed_port, "open_connection", MagicMock(side_effect=NoAnswerError("it has ended"))
+    )
+    with borrowed_port.Loan(Config(), said.append) as loan:
+        loan._data = schema.ReplyData(numbers=[7], loan=8)
+    assert said == ["the daemon did not take the port back (it has ended): `acsard call activate`"]
+
+
+def test_without_json_a_check_that_cannot_go_on_prints_only_the_reason(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(NoPortError):
+        called(tmp_path, "--port", str(tmp_path / "none"), "--yes")
+    file = tmp_path / "acsard.toml"
+    assert capsys.readouterr() == (f"port {tmp_path / 'none'}, configuration {file}\n", "")
+
+
 def test_a_port_without_an_answer_is_not_written(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -192,7 +319,10 @@ def test_without_questions_only_a_speed_of_the_file_is_driven(
     (tmp_path / "acsard.toml").unlink(missing_ok=True)
     run = MagicMock()
     monkeypatch.setattr(procedure, "run", run)
+    begun = MagicMock()
+    monkeypatch.setattr(Prompt, "begin", begun)
     nothing_judged = called(tmp_path, "--port", "sim", "--yes", text=f"[limits]\n{text}\n")
+    assert "the built-in SIMULATOR" in begun.call_args.args[-1]
     assert nothing_judged == Exit.FAILURE
     assert run.call_args.kwargs == {"fast": fast}
 

@@ -10,11 +10,13 @@ from contextlib import nullcontext
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
+from unittest.mock import Mock
 
 import pytest
 from msgspec.structs import replace
 
-from acsard.cli import foxglove, main, move, parser, robot_options
+from acsard.bus.robot_discovery import Presence
+from acsard.cli import drive, foxglove, main, move, parser, robot_options
 from acsard.cli.command_line import VERBS
 from acsard.cli.move import _parsed
 from acsard.cli.robot_options import Silence
@@ -25,6 +27,7 @@ from acsard.core.values import Pose
 from acsard.host import errors
 from acsard.host.errors import (
     MendableError,
+    NotPermittedError,
     UsageError,
 )
 from acsard.top import terminal
@@ -134,6 +137,44 @@ def test_each_silence_is_explained_once(
         assert capsys.readouterr().err == "acsard: the way to it is cut\n"
 
 
+def test_a_silence_without_a_known_reason_is_looked_into_once_in_each_two_seconds(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    looks = list[str]()
+
+    def none_yet(_: object, key: str) -> str:
+        looks.append(key)
+        return ""
+
+    monkeypatch.setattr(robot_options, "_none_yet", none_yet)
+    silence = Silence(ROBOT, "state")
+    for tenths in range(100):
+        silence.look(tenths / 10)
+    assert len(looks) == int(9.9 / FIRST_STATE_TIMEOUT_S)
+
+
+@each(
+    ("status", "trouble", "words"),
+    [
+        (None, "", ""),
+        (Presence(linked=True, here=True), "", "robot ghost is there, but state does not arrive"),
+        (Presence(linked=False, here=False), "", "the connection to tls/x:1 is lost"),
+        (Presence(linked=False, here=False), "no route", "/state: no route"),
+        (Presence(linked=True, here=False), "no route", "robot ghost is not visible"),
+    ],
+)
+def test_the_reason_of_a_first_silence_is_the_network_or_what_the_bus_shows(
+    status: Presence | None, trouble: str, words: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    where = SimpleNamespace(robot_id="ghost", endpoint="tls/x:1", tls="")
+    robot: Any = SimpleNamespace(where=where, session=None, key=lambda key: f"acsard/ghost/{key}")
+    monkeypatch.setattr(robot_options, "presence", lambda *_: status)
+    monkeypatch.setattr(robot_options, "_of_link", lambda _: trouble)
+    reason = robot_options._none_yet(robot, "state")
+    assert words in reason
+    assert reason.startswith("waiting for messages on acsard/ghost/state: ") == bool(words)
+
+
 def test_ways_are_metres_and_degrees_in_their_directions() -> None:
     words = ["forward", "1", "left", "90", "back", "0.5", "right", "45"]
     assert _parsed(words) == [(False, 1.0), (True, 90.0), (False, -0.5), (True, -45.0)]
@@ -214,6 +255,14 @@ def test_a_keyboard_whose_certificate_may_not_drive_is_refused_before_the_screen
     monkeypatch.setattr(terminal, "drive", lambda _: pytest.fail("the screen opened"))
     assert main(["drive"]) == code
     assert us.describe() in capsys.readouterr().err
+
+
+def test_the_screen_of_a_drive_has_the_limits_if_the_client_may_read_them() -> None:
+    limits = {"limits": {"linear_speed": 0.5, "angular_speed": 2.0}}
+    robot: Any = SimpleNamespace(get={"config": limits}.get)
+    assert drive._limits(robot) == "0.50 m/s, 2.00 rad/s"
+    robot.get = Mock(side_effect=NotPermittedError("for maintainers"))
+    assert drive._limits(robot) == ""
 
 
 def test_an_interrupted_drive_prints_how_far_it_came_and_what_is_wrong(

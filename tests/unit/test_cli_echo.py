@@ -9,11 +9,20 @@ import msgspec
 import pytest
 
 from acsard.cli import main
-from acsard.cli.echo import _message_text, _print
+from acsard.cli.echo import _message_text, _print, _shortened
 from acsard.cli.replies import json_line
-from acsard.core.messages.encodings import Decoder, Format, encode, encoding_name
+from acsard.core.messages.encodings import (
+    DecodeError,
+    Decoder,
+    Format,
+    encode,
+    encoding_name,
+)
 from acsard.core.messages.schema import (
     Header,
+    Odometry,
+    PoseStamped,
+    RobotState,
     Twist,
     TwistStamped,
     Vector3,
@@ -103,6 +112,10 @@ def test_a_key_without_a_short_form_is_refused_with_those_that_have_one(
     output = capsys.readouterr().err
     assert "tf has no short form" in output
     assert all(key in output for key in ("odom", "state", "cmd_vel_out", "sim/pose"))
+    for key, kind in (("odom", Odometry), ("sim/pose", PoseStamped), ("state", RobotState)):
+        name = encoding_name("json", kind.__name__)
+        with pytest.raises(DecodeError, match="missing required field"):
+            _shortened(key).decode(name, b"{}")
 
 
 @each("form", ["json", "msgpack"])

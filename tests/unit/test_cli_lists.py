@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
+import msgspec
 import pytest
 from msgspec.structs import replace
 
@@ -60,4 +61,7 @@ def test_the_ports_and_what_looks_like_a_board_are_told_in_the_approved_words(
         code = main(["ports"])
         out, err = capsys.readouterr()
         text += f"--- {len(found)} ports, exit {code}\n{out}{err}"
+        assert main(["ports", "--json"]) == code
+        printed = msgspec.json.decode(capsys.readouterr().out, type=list[SerialDevice])
+        assert printed == found
     approved(Path(__file__).with_name("words") / "ports.txt", text)

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from contextlib import nullcontext
 from pathlib import Path
 from typing import cast
 
 import pytest
 
-from acsard.cli.replies import Replies, print_each
+from acsard.cli import get, main
+from acsard.cli.replies import Replies, of_each, print_each
 from acsard.client.connection import Connection
 from acsard.core.messages.schema import ServiceReply
 from acsard.host.errors import Exit, NoAnswerError, NotPermittedError
@@ -35,6 +37,47 @@ def test_a_refused_permission_is_no_silence(
     lines = capsys.readouterr().out.splitlines()
     assert ("b: NOT ALLOWED: role operator" in lines) == (replies.get("b") is BARRED)
     assert ("b: NO ANSWER" in lines) == (replies.get("b") is SILENT)
+
+
+class Sibling:
+    """A robot of a fleet, of which `b` is silent."""
+
+    def __init__(self, robot_id: str = "") -> None:
+        self.robot_id = robot_id
+        self.sibling = Sibling
+
+    def reply(self, key: str) -> tuple[str, bytes]:
+        if self.robot_id == "b":
+            raise SILENT
+        return "application/json", b'{"key":"%b"}' % key.encode()
+
+    def call(self) -> ServiceReply:
+        self.reply("")
+        return DONE
+
+
+def test_each_robot_of_a_fleet_is_called_and_a_silent_one_hides_no_other() -> None:
+    replies = of_each(cast("Connection", Sibling()), "abc", Sibling.call)  # type: ignore[arg-type]
+    assert replies == {"a": DONE, "b": SILENT, "c": DONE}
+
+
+@pytest.mark.parametrize(
+    ("ids", "code", "lines"),
+    [
+        ("", Exit.OK, ['{"key":"state"}']),
+        ("ac", Exit.OK, [f'{{"robot":"{name}","message":{{"key":"state"}}}}' for name in "ac"]),
+        ("ab", Exit.UNREACHABLE, ['{"robot":"a","message":{"key":"state"}}']),
+    ],
+)
+def test_get_prints_the_answer_of_each_robot_and_fails_if_one_is_silent(
+    ids: str, code: Exit, lines: list[str],
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str],
+) -> None:  # fmt: skip
+    monkeypatch.setattr(get, "connected_to_many", lambda _: nullcontext((Sibling(), tuple(ids))))
+    assert main(["get", "state"]) == code
+    out, err = capsys.readouterr()
+    assert out.splitlines() == lines
+    assert ("b: NO ANSWER: nobody" in err) == (code != Exit.OK)
 
 
 def test_a_cause_that_several_robots_have_is_printed_once(

@@ -14,7 +14,8 @@ import zenoh
 from msgspec import structs
 
 from acsard import client
-from acsard.client import AcsardError, Client, NoAnswerError, asynchronous, driving
+from acsard.bus.robot_discovery import Presence
+from acsard.client import AcsardError, Client, NoAnswerError, asynchronous, connection, driving
 from acsard.client.asynchronous import AsyncClient
 from acsard.client.connection import MIN_SPACING_S, Connection, accepted
 from acsard.client.driving import UnheardError
@@ -112,6 +113,19 @@ def test_each_command_echoes_the_newest_beat_and_none_is_sent_before_the_first(
         (number, client.sender) for number in (1, 2, 3)
     ]
     assert client_of(Session("fedcba9876543210")).sender != client.sender
+
+
+def test_a_beat_that_is_not_the_robot_s_or_cannot_be_read_is_not_echoed(session: Session) -> None:
+    client = client_of(session)
+    client.send(0.0)
+    forged = SimpleNamespace(to_bytes=lambda: encode(Beat(BEAT.run, 9), "msgpack"))
+    for key, payload in (
+        ("acsard/*/beat", forged),
+        (session.beat_key, SimpleNamespace(to_bytes=lambda: b"{")),
+    ):
+        session.publish(SimpleNamespace(encoding="", payload=payload, key_expr=key))
+        client.send(0.5)
+    assert {command.echo for command in session.heard} == {Echo(BEAT.run, BEAT.boot_us * 1000)}
 
 
 def test_the_commands_of_two_threads_leave_in_their_order_and_with_the_pause(
@@ -271,6 +285,36 @@ def test_an_error_reply_is_repeated_if_the_daemon_is_busy_and_named_otherwise(
 
 
 @each(
+    ("key", "present", "words"),
+    [
+        ("battery", True, "battery has a value only while the board reports"),
+        ("config", True, "is the daemon of robot.id 'acsar' stuck"),
+        ("config", None, "is the daemon of robot.id 'acsar' stuck"),  # the session is closing
+        ("config", False, "no daemon"),
+        ("battery", False, "no daemon"),
+    ],
+)
+def test_without_tls_a_silence_is_explained_by_what_the_bus_shows(
+    key: str, present: bool | None, words: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    status = None if present is None else Presence(linked=True, here=present)
+    monkeypatch.setattr(connection, "presence", lambda *_: status)
+    ours = client_of(Session("0123456789abcdef"))
+    ours.where = ours.where._replace(endpoint="tcp/127.0.0.1:1")
+    with pytest.raises(NoAnswerError, match=words):
+        ours.reply(key)
+
+
+def test_only_a_good_answer_to_a_query_is_taken(session: Session) -> None:
+    taken, queried = list[object](), list[Any]()
+    vars(session)["get"] = lambda _, take, **__: queried.append(take)
+    client_of(session).start_query("state", taken.append)
+    for reply in (error("Timeout"), SimpleNamespace(ok="state", err=None)):
+        queried[0](reply)
+    assert taken == ["state"]
+
+
+@each(
     ("identity", "words"),
     [
         (ClientIdentity("", "anna", "anna/1", "acsar"), "no daemon answers as 'acsar'"),
@@ -308,6 +352,8 @@ def test_a_call_above_the_size_limit_is_refused_in_the_daemon_s_words(
     assert client_of(session).set(larger) == refusal
     with pytest.raises(ReplyError, match="the payload has over 4096 bytes"):
         accepted(refusal)
+    done = ServiceReply(True, "done")
+    assert accepted(done) is done
     with pytest.raises(NoAnswerError):  # a stop is sent whatever its size
         client_of(session).request("stop", {"why": "x" * (MAX_COMMAND_BYTES + 1)})
 
@@ -321,7 +367,7 @@ def test_a_release_names_the_causes_that_are_older_than_the_call(
     def get(key: str) -> object:
         nonlocal now_s
         now_s += 1.0
-        ages = {1: 5.0, 2: 1.01, 3: 0.99, 4: None}
+        ages = {1: 5.0, 2: 1.0, 3: 0.99, 4: None}
         causes = [SimpleNamespace(number=number, age=age) for number, age in ages.items()]
         return {"state": SimpleNamespace(causes=causes)}[key]
 
@@ -354,6 +400,24 @@ def test_over_tls_a_service_that_the_robot_does_not_have_is_refused_with_those_t
         ours.request("danc", {})
     with pytest.raises(client.NotPermittedError):
         ours.request("dance", {})
+
+
+@each(
+    ("tls", "silence", "words"),
+    [
+        ("", "nobody is there", "^nothing received$"),
+        ("certificates", "", "^nothing received$"),
+        ("certificates", "is anna listed?", "^nothing received; is anna listed\\?$"),
+    ],
+)
+def test_the_error_of_a_silent_robot_names_the_certificate_if_that_may_be_the_reason(
+    session: Session, monkeypatch: pytest.MonkeyPatch, tls: str, silence: str, words: str
+) -> None:
+    ours = client_of(session)
+    ours.where = ours.where._replace(tls=tls)
+    monkeypatch.setattr(ours, "whoami", lambda: SimpleNamespace(silence=silence))
+    with pytest.raises(NoAnswerError, match=words):
+        raise ours.explain_error(NoAnswerError("nothing received"))
 
 
 @each(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
+from collections.abc import Callable
 from types import SimpleNamespace
 from typing import Any
 
@@ -39,9 +40,10 @@ class Robot:
     Its odometry shows each `count` (m) of a wheel on the line y = -2.
     """
 
-    def __init__(self, delay_s: float, yaw: float = 0.0, count: float = 0.0) -> None:
-        self._count = count
-        self.x, self.y, self.yaw = 3.0, -2.0, yaw
+    def __init__(
+        self, delay_s: float, yaw: float = 0.0, slip: float = 0.0, count: float = 0.0
+    ) -> None:
+        self.x, self.y, self.yaw, self._slip, self._count = 3.0, -2.0, yaw, slip, count
         self._commands = deque([REST] * round(delay_s / PERIOD_S))
 
     def odom(self) -> Odometry:
@@ -62,7 +64,7 @@ class Robot:
             course.odom(self.odom())
             self._commands.append(REST if course.is_done else course.twist)
             twist = self._commands.popleft()
-            self.yaw += max(-1.0, min(1.0, twist.angular)) * PERIOD_S
+            self.yaw += (max(-1.0, min(1.0, twist.angular)) + self._slip) * PERIOD_S
             self.x += twist.linear * math.cos(self.yaw) * PERIOD_S
             self.y += twist.linear * math.sin(self.yaw) * PERIOD_S
             if course.is_done and set(self._commands) <= {REST}:
@@ -88,6 +90,24 @@ def test_a_straight_course_ends_within_a_count_of_coarse_encoders(
     robot = Robot(0.05, count=count)
     robot.follow(Straight(robot.odom(), distance, 0.3))
     assert robot.x - 3.0 == pytest.approx(distance, abs=1.5 * count + 0.005)
+
+
+@each("distance", [1.0, -1.0])
+@each("slip", [0.05, -0.05])
+def test_a_robot_that_drifts_is_steered_back_to_its_heading(distance: float, slip: float) -> None:
+    """One side of the robot is faster by a twentieth of a radian a second."""
+    robot = Robot(0.1, yaw=2.5, slip=slip)
+    robot.follow(Straight(robot.odom(), distance, 0.3))
+    assert abs(robot.yaw - 2.5) < 0.03
+    beside = -(robot.x - 3.0) * math.sin(2.5) + (robot.y + 2.0) * math.cos(2.5)
+    assert abs(beside) < 0.03
+
+
+@each("way", [0.02, 0.1, 0.5, 2.0, 6.0])
+def test_a_fast_robot_slows_down_at_a_rate_that_it_can_follow(way: float) -> None:
+    speed = Straight(Robot(0.0).odom(), way, 9.0).twist.linear
+    assert speed**2 / (2 * way) <= 0.3001
+    assert speed == pytest.approx(min(math.sqrt(2 * 0.3 * way), 2.0 * way))
 
 
 @each("degrees", [90.0, -720.0, 1.0, 0.0])
@@ -139,6 +159,15 @@ def test_a_move_stops_when_the_odometry_falls_silent() -> None:
     assert next(n for n, speed in enumerate(reversed(world.sent)) if speed) >= 10
 
 
+def test_a_move_does_not_begin_without_a_state_that_counts_the_poses() -> None:
+    world = WithOdometry(60.0)
+    world.published = world.answers = False
+    with pytest.raises(NoAnswerError, match="nothing received"):
+        world.move()
+    assert world.passed < 3.0
+    assert world.sent == []
+
+
 def test_a_move_of_a_robot_that_waits_for_its_board_ends_with_that_reason() -> None:
     missing = "/dev/ttyACM0 does not exist; plug the device in"
     world = WithOdometry(0.0, after(0.0, replace(STOPPED, mode="waiting", reason=missing)))
@@ -169,8 +198,9 @@ class Rolling(WithOdometry):
         self.linear, self.angular = linear, angular
 
     def follow(
-        self, steps: Steps, is_set: float = math.inf, by: tuple[float, float, float] = (3.0, 2.0, 2)
-    ) -> None:
+        self, steps: Steps, is_set: float = math.inf,
+        by: tuple[float, float, float] = (3.0, 2.0, 2), sets: Callable[[], object] | None = None,
+    ) -> None:  # fmt: skip
         """Drive a course, for at most 1000 s. After `is_set` s, the pose is set."""
         robot: Any = self
         body = self.body
@@ -186,6 +216,8 @@ class Rolling(WithOdometry):
                 x, y, yaw = by
                 body.x, body.y, body.yaw, is_set = body.x + x, body.y + y, body.yaw + yaw, math.inf
                 self.counters["poses_set"] = self.counters.get("poses_set", 0) + 1
+                if sets is not None:
+                    sets()
 
 
 def test_a_long_way_at_a_low_speed_is_driven_to_its_end() -> None:
@@ -207,6 +239,17 @@ def test_a_course_ends_if_the_pose_is_set_on_the_way(by: tuple[float, float, flo
     with pytest.raises(NotDrivenError, match="the pose was set"):
         world.follow(turn(90.0, 0.8), is_set=1.0, by=by)
     assert world.turned < 1.0
+
+
+def test_a_course_ends_if_the_daemon_is_started_anew_on_the_way() -> None:
+    world = Rolling()
+    world.counters = {"poses_set": 5}
+
+    def restart() -> None:
+        world.counters = {"poses_set": 1}
+
+    with pytest.raises(NotDrivenError, match="the daemon was started anew"):
+        world.follow(move(1.0, 0.3), is_set=2.0, sets=restart)
 
 
 def test_a_pose_that_was_set_before_a_course_or_in_its_last_moments_counts_likewise() -> None:

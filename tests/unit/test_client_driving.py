@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterator
 from typing import Any
 
 import pytest
+import zenoh
 from msgspec.structs import replace
 
 from acsard.client.driving import (
@@ -206,7 +207,7 @@ AGAINST: list[tuple[str, Says, type[Exception], str, float, bool]] = [
      NotDrivenError, "rear_left wheel is stuck", SETTLED_S, False),
     ("switched off", after(0, replace(STOPPED, mode="inactive", reason="switched off")),
      NotDrivenError, "switched off", SETTLED_S, False),
-    ("unlisted", after(0, replace(FOLLOWED, sources=[source(name="nav")])), NotDrivenError,
+    ("unlisted", after(0, replace(FOLLOWED, sources=[source(name="nav")])), UnheardError,
      "app is not one of commands.sources: nav; add app",
      SETTLED_S, False),
     ("no link", after(0, replace(STOPPED, mode="waiting", reason="waiting for the first lines")),
@@ -230,11 +231,27 @@ def test_a_drive_that_is_not_followed_ends_with_the_reason_and_a_zero(
     name: str, responder: Says, error: type[Exception], words: str, took: float, moved: bool
 ) -> None:
     world = World(responder)
-    with pytest.raises(error, match=words):
+    with pytest.raises(error, match=words) as raised:
         world.drive(60.0)
+    assert type(raised.value) is error
+    if isinstance(raised.value, UnheardError):
+        assert raised.value.lacks_only_commands == (name == "unheard")
     assert took - 0.05 <= world.passed <= took + 0.3
     assert (0.5 in world.sent) == moved
     assert (world.sent[-1], world.subscribed) == (0.0, False)
+
+
+def test_a_drive_whose_connection_is_closed_ends_with_that_reason() -> None:
+    class Closing(World):
+        def send(self, linear: float, angular: float = 0.0) -> None:
+            super().send(linear, angular)
+            if self.passed > 0.9:
+                raise zenoh.ZError("session closed")
+
+    world = Closing(followed)
+    with pytest.raises(NoAnswerError, match="was closed while the robot was driving"):
+        world.drive(60.0)
+    assert 0.9 < world.passed < 1.0
 
 
 def test_a_stop_while_the_last_zeros_are_sent_is_named() -> None:

@@ -13,12 +13,14 @@ from acsard.bus.subscription import MAX_QUEUED_SAMPLES
 from acsard.client.follower import (
     FIRST_STATE_TIMEOUT_S,
     FLEET_QUERY_PERIOD_S,
+    MONOTONIC_COUNTERS,
     QUERY_PERIOD_S,
     ROBOT_SILENCE_TIMEOUT_S,
     Follower,
     Watch,
     restarted,
 )
+from acsard.client.follower import UNREADABLE as UNREADABLE_TEXT
 from acsard.core.messages.schema import RobotState, Time
 from tests.unit.screens import BEFORE, STATE, raw_sample, sample_of
 
@@ -91,6 +93,12 @@ def test_decreasing_counters_show_a_restarted_daemon() -> None:
     assert not restarted(BEFORE, STATE)
     assert restarted(STATE, BEFORE)
     assert restarted(STATE, replace(STATE, counters={}))
+    assert not restarted(replace(STATE, counters={}), STATE)
+    assert not restarted(STATE, STATE)
+    assert not restarted(replace(STATE, counters={}), replace(STATE, counters={}))
+    one = MONOTONIC_COUNTERS[0]
+    fewer = STATE.counters | {one: STATE.counters[one] - 1}
+    assert restarted(STATE, replace(STATE, counters=fewer))
 
 
 class Robot:
@@ -141,6 +149,8 @@ def test_unreadable_messages_are_counted_until_a_readable_one_and_a_flood_blocks
     robot.queue.extend([UNREADABLE] * (MAX_QUEUED_SAMPLES + 7))
     assert watch.poll(0.0) == []
     assert (watch.unreadable, len(robot.queue)) == (MAX_QUEUED_SAMPLES, 7)
+    assert watch.silence(FIRST_STATE_TIMEOUT_S + TICK) == UNREADABLE_TEXT
     robot.queue.append(sample_of(at(1)))
     watch.poll(0.0)
     assert watch.unreadable == 0
+    assert "nothing received" in watch.silence(FIRST_STATE_TIMEOUT_S + TICK)

@@ -67,6 +67,9 @@ def test_a_silent_robot_leads_to_questions_first_about_the_id_and_to_no_claim() 
     stranger = ClientIdentity("", "", "joe/1/aa", "robot1", "tcp/127.0.0.1:7448")
     assert stranger.describe().startswith("no daemon answers as 'robot1' at tcp/127.0.0.1:7448")
     assert "certificate" not in stranger.describe()
+    unknown = ClientIdentity("", "", "joe/1/aa", "robot1").describe()
+    assert unknown.startswith("no daemon answers as 'robot1' (queried key: acsard/robot1/")
+    assert ClientIdentity("", "", "joe/1/aa").describe().startswith("no daemon answers: is --id")
     assert ClientIdentity("viewer", "anna", "x").silence == stranger.silence == ""
 
 

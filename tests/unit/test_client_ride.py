@@ -104,6 +104,20 @@ def test_a_robot_that_never_accepts_the_zeros_ends_the_ride() -> None:
     assert rider.ride.ended
 
 
+def test_zeros_that_were_not_accepted_before_the_person_let_go_do_not_count() -> None:
+    rider = Rider(replace(RESTING, mode="ready", source="", reason="nav drives"))
+    rider.wish(AHEAD, OPEN_TIMEOUT_S - 0.2)
+    rider.wish(None, 0.5)
+    rider.wish(AHEAD, OPEN_TIMEOUT_S - 0.2)
+    assert rider.ride.ended == ""
+
+
+def test_a_zero_of_a_program_is_sent_once_and_keeps_no_other_sender_waiting() -> None:
+    rider = Rider()
+    assert rider.wish(REST, 0.01) == [REST]
+    assert rider.wish(None, 5.0) == []
+
+
 # the zeros at the end
 
 
@@ -138,6 +152,8 @@ def test_zeros_end_if_a_state_shows_that_the_sender_stopped_the_robot(
     [
         MOVING,
         replace(RESTING, angular=0.5),
+        replace(RESTING, angular=-0.5),
+        replace(RESTING, linear=-0.5),
         replace(RESTING, linear=None, angular=None),
         # The daemon has not received the commands that the network holds.
         with_age(RESTING, 0.25),

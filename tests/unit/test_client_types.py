@@ -1,21 +1,28 @@
-"""`get` and `messages` are typed for each key of the table, so a type checker finds mistakes."""
+"""Both clients: the same names, their answers, and a type for each key of the table."""
 
 from __future__ import annotations
 
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import AsyncIterator, Callable
+from functools import partial
+from inspect import signature
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, get_args, get_overloads, get_type_hints
 
+import msgspec
 import pytest
 
 from acsard.client import AsyncClient, Client
 from acsard.client.reads import FOLLOWED_KEYS, QUERIED_KEYS, AsyncReads, Reads
 from acsard.core.messages.keys_and_roles import by_key
-from acsard.core.messages.schema import MESSAGES
+from acsard.core.messages.schema import MESSAGES, Beat, ServiceReply
+from acsard.core.values import Pose
+from acsard.host.errors import ReplyError, UsageError
 from tests.each import each
 from tests.system.harness import ROOT
+from tests.unit.screens import sample_of
 
 
 def types(method: Callable[..., object]) -> dict[str, object]:
@@ -53,6 +60,84 @@ def test_both_clients_show_the_same_few_names() -> None:
             "call", "clear", "drive", "get", "messages", "move", "name", "pose", "send", "set",
             "stop", "turn", "whoami",
         }, client  # fmt: skip
+
+
+@each("name", ["call", "clear", "drive", "move", "pose", "send", "set", "stop", "turn", "whoami"])
+def test_both_clients_have_the_same_parameters_and_defaults(name: str) -> None:
+    one, other = (signature(getattr(client, name)) for client in (Client, AsyncClient))
+    assert one.parameters == other.parameters
+
+
+class Asked:
+    """A connection that returns what it was asked, and refuses `clear`."""
+
+    name = "me"
+
+    def call(self, service: str, **fields: object) -> ServiceReply:
+        return ServiceReply(service != "clear", f"{service} {fields}")
+
+    def set(self, settings: object) -> ServiceReply:
+        return ServiceReply(True, f"set {settings}")
+
+    def whoami(self) -> str:
+        return "whoami"
+
+    def pose(self) -> Pose:
+        return Pose(1.0, 2.0, 3.0)
+
+    def send(self, *speeds: float) -> None:
+        self.sent = speeds
+
+    def reply(self, name: str) -> tuple[str, bytes]:
+        return "application/json", msgspec.json.encode({"asked": name})
+
+    def subscribe(self, name: str) -> Any:
+        samples = [sample_of(beat) for beat in BEATS]
+
+        async def arriving() -> AsyncIterator[Any]:
+            for sample in samples:
+                yield sample
+
+        return SimpleNamespace(until_silence=lambda timeout: iter(samples), arriving=arriving)
+
+    _reply, _subscribe = reply, subscribe
+
+
+BEATS = [Beat(7, 1), Beat(7, 2)]
+
+
+@pytest.mark.parametrize("kind", [Client, AsyncClient])
+async def test_both_clients_ask_the_connection_and_return_its_answer(
+    kind: type[Client] | type[AsyncClient],
+) -> None:
+    connection: Any = Asked()
+    robot: Any = kind(connection)
+
+    async def result(answer: Any) -> Any:
+        return await answer if kind is AsyncClient else answer
+
+    assert (await result(robot.stop())).message == "stop {}"
+    assert (await result(robot.call("set_pose", x=1.0))).message == "set_pose {'x': 1.0}"
+    assert (await result(robot.set({"rates.odom": 5.0}))).message == "set {'rates.odom': 5.0}"
+    assert await result(robot.whoami()) == "whoami"
+    assert await result(robot.pose()) == Pose(1.0, 2.0, 3.0)
+    assert await result(robot.get("config")) == {"asked": "config"}
+    robot.send(0.5, 0.2)
+    assert connection.sent == (0.5, 0.2)
+    assert robot.name == "me"
+    robot.name = "you"
+    assert connection.name == "you"
+    for asks in (robot.clear, partial(robot.call, "clear")):
+        with pytest.raises(ReplyError, match="clear"):
+            await result(asks())
+    found = robot.messages("beat")
+    beats = [beat async for beat in found] if kind is AsyncClient else list(found)
+    assert beats == BEATS
+    for name, words in (("config", r"use get\('config'\)"), ("odmo", "did you mean odom")):
+        with pytest.raises(UsageError, match=words):
+            robot.messages(name)
+    with pytest.raises(UsageError, match="did you mean odom"):
+        await result(robot.get("odmo"))
 
 
 STUDENT = """\

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import json
 import os
 import socket
 import sys
 from collections import deque
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
+from threading import Event
 from types import SimpleNamespace
 from typing import Any, cast
+from unittest.mock import Mock
 
 import pytest
 import zenoh
@@ -24,6 +28,7 @@ from acsard.core.config.settings import Config, RosConfig
 from acsard.core.messages.schema import (
     Events,
     LogEvent,
+    ServiceReply,
     Time,
 )
 from acsard.core.messages.signature import public_name
@@ -33,11 +38,11 @@ from acsard.foxglove import bridge as module
 from acsard.foxglove.bridge import Bridge
 from acsard.foxglove.bridge import configuration as module_configuration
 from acsard.foxglove.relay import EventDeduplicator
-from acsard.foxglove.server import ShownTopics, start
+from acsard.foxglove.server import ShownTopics, start, stop_service
 from acsard.host import clock
-from acsard.host.errors import InUseError, NotPermittedError, ReplyError
+from acsard.host.errors import InUseError, NoAnswerError, NotPermittedError, ReplyError
 from tests.each import each
-from tests.unit.screens import raw_sample, sample_of
+from tests.unit.screens import STATE, raw_sample, sample_of
 
 UNREADABLE = ReplyError("cannot read the robot's state; use the same version here")
 
@@ -141,6 +146,9 @@ def test_a_late_viewer_gets_the_last_message_of_a_rare_key(
     out.channel = cast("Any", SimpleNamespace(log=logged.append))
     relay.follow({topic}, set())
     assert logged == []
+    relay.follow({topic}, {topic, "/topic_of_an_earlier_namespace"})
+    assert logged == [b"the last one"] * again
+    out.last = None  # nothing has arrived yet
     relay.follow({topic}, {topic})
     assert logged == [b"the last one"] * again
 
@@ -165,6 +173,77 @@ def test_a_late_viewer_of_the_log_gets_the_last_events_too(world: World) -> None
     relay.forward()
     assert len(logged) == 7
     assert b"mode3" in logged[-1]
+
+
+def test_a_topic_that_a_viewer_opens_is_followed_queried_and_forwarded(
+    world: World, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    relay, queried, woken = world.bridge._relay, list[str](), list[object]()
+    queue = deque[Any]([raw_sample(b"{"), *[sample_of(STATE)] * 150, None])
+    stream: Any = SimpleNamespace(
+        try_recv=queue.popleft, put=None, wakes=woken.append, undeclare=lambda: None
+    )
+    monkeypatch.setattr(relay._robot, "subscribe", lambda key: stream)
+    monkeypatch.setattr(relay._robot, "start_query", lambda key, take: queried.append(key))
+    for key, is_queried in (("state", True), ("tf_static", False)):  # Zenoh repeats the latter
+        queried.clear()
+        logged = list[bytes]()
+        topic = full_name(world.namespace, key)
+        relay._outs[topic].channel = cast("Any", SimpleNamespace(log=logged.append))
+        relay.follow({topic}, {topic})
+        assert queried == ["state"] * is_queried
+        if key == "state":
+            relay.forward()
+            assert len(logged) == 100, "the newest of a round"
+    assert woken == [world.bridge._wake.set] * 2
+
+
+def test_a_session_that_closes_ends_no_round(world: World) -> None:
+    relay = world.bridge._relay
+    stream: Any = SimpleNamespace(try_recv=Mock(side_effect=zenoh.ZError("closed")))
+    relay._followed["odom"] = stream
+    relay.forward()
+
+
+def test_the_end_of_the_bridge_waits_for_the_server_but_not_for_ever(
+    world: World, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    released, stopped = Event(), Event()
+
+    def stop() -> None:
+        stopped.set()
+        released.wait(20.0)
+
+    world.bridge._server = cast(Any, SimpleNamespace(stop=stop))
+    monkeypatch.setattr(module, "STOP_TIMEOUT_S", 0.01)
+    world.bridge.close()
+    assert stopped.wait(20.0)
+    released.set()
+
+
+def test_a_topic_that_no_viewer_shows_any_more_costs_no_messages(world: World) -> None:
+    relay, ended = world.bridge._relay, list[str]()
+    for key in ("odom", "state"):
+        stream: Any = SimpleNamespace(undeclare=partial(ended.append, key))
+        relay._followed[key] = stream
+    relay.follow({full_name(world.namespace, "odom")}, set())
+    assert ended == ["state"]
+    assert list(relay._followed) == ["odom"]
+
+
+@each(("namespace", "name"), [("", "/acsard/stop"), ("robot1", "/robot1/acsard/stop")])
+@each("error", [None, NoAnswerError("nobody answers")])
+def test_the_service_that_stops_the_robot_answers_also_without_a_robot(
+    namespace: str, name: str, error: Exception | None
+) -> None:
+    robot: Any = Mock(call=Mock(return_value=ServiceReply(True, "stopped"), side_effect=error))
+    service = stop_service(robot, RosConfig(namespace=namespace))
+    assert service.name == name
+    reply = json.loads(service.handler(cast(Any, None)))
+    robot.call.assert_called_once_with("stop")
+    assert (reply["success"], reply["message"]) == (
+        (True, "stopped") if error is None else (False, "nobody answers")
+    )
 
 
 class Asked:
@@ -285,6 +364,8 @@ def test_the_configuration_is_read_again_if_the_daemon_restarts_meanwhile(
 
 def test_a_viewer_that_comes_while_the_daemon_is_gone_is_told(world: World) -> None:
     rounds: list[Any] = []
+    forwarded = list[bool]()
+    world.bridge._relay.forward = lambda: forwarded.append(True)  # type: ignore[method-assign]
     channel = cast(Any, SimpleNamespace(topic="/odom"))
     world.bridge._relay.follow = lambda *topics: rounds.append(topics)  # type: ignore[method-assign]
     for number, shown in ((1, []), (2, [GONE, GONE])):
@@ -295,6 +376,24 @@ def test_a_viewer_that_comes_while_the_daemon_is_gone_is_told(world: World) -> N
         world.passes(1.0)
     assert [fresh for _, fresh in rounds if fresh] == [{"/odom"}] * 2
     assert all(topics == {"/odom"} for topics, _ in rounds)
+    assert len(forwarded) == len(rounds)
+
+
+def test_the_bridge_makes_rounds_until_its_end(world: World) -> None:
+    rounds = 0
+
+    def make_round() -> None:
+        nonlocal rounds
+        rounds += 1
+        if rounds < 3:
+            world.bridge._wake.set()
+        else:
+            world.bridge.end()
+
+    world.bridge._round = make_round  # type: ignore[method-assign]
+    world.bridge._wake.set()
+    world.bridge.run()
+    assert rounds == 3
 
 
 @pytest.mark.timeout(20)
@@ -335,6 +434,12 @@ def test_each_event_is_reported_once(before: int, now: int) -> None:
     deduplicator.of(events(before))
     stored = range(max(before, now - 20), now)
     assert names(deduplicator, events(now)) == [f"mode{n}" for n in stored]
+
+
+def test_an_event_that_lasts_is_reported_once_although_it_counts_several_times() -> None:
+    deduplicator = EventDeduplicator()
+    deduplicator.of(events(3))
+    assert names(deduplicator, replace(events(3), stamp=Time(5), total=6)) == []
 
 
 def test_an_answer_older_than_the_last_message_reports_no_event() -> None:

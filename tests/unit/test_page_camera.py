@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable
-from unittest.mock import Mock
+from collections.abc import AsyncIterator, Callable
+from typing import Any
+from unittest.mock import MagicMock, Mock
 
 import pytest
 from aiohttp import StreamReader
 
+from acsard.core.values import NS_PER_S
+from acsard.host import clock
 from acsard.web import camera as module
+from acsard.web.answers import TroubleError
 from acsard.web.camera import STREAM_ERRORS, Camera, pictures
 from tests.each import each
 
@@ -87,6 +91,45 @@ async def test_an_answer_that_is_not_a_stream_is_an_error() -> None:
     reader = StreamReader(Mock(_reading_paused=False), 2**16)
     with pytest.raises(ValueError, match="'text/html', not an MJPEG stream"):
         await anext(pictures("text/html", reader))
+
+
+async def test_a_camera_that_nobody_asks_for_is_read_no_more(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    now_ns, read = 0, 0
+    monkeypatch.setattr(clock, "steady_ns", lambda: now_ns)
+    camera = Camera("http://127.0.0.1:9/")
+
+    async def stream(*_: object) -> AsyncIterator[bytes]:
+        nonlocal now_ns, read
+        for read in range(1, 20):
+            yield bytes(read)
+            now_ns += NS_PER_S
+        pytest.fail("it is read on")
+
+    monkeypatch.setattr(module, "pictures", stream)
+    answer = Mock(status=200, headers={})
+    session: Any = Mock(get=Mock(return_value=MagicMock()))
+    session.get.return_value.__aenter__.return_value = answer
+    await camera._read(session)
+    assert read == 7  # the sixth one came 5 s after the last request
+    assert camera.newest is not None
+    assert camera.newest.body == bytes(6)
+
+
+@pytest.mark.parametrize(
+    ("error", "detail"), [(TimeoutError(), "no answer"), (OSError("no route"), "no route")]
+)
+async def test_a_camera_that_does_not_answer_is_explained(
+    monkeypatch: pytest.MonkeyPatch, error: Exception, detail: str
+) -> None:
+    monkeypatch.setattr(module, "PICTURE_TIMEOUT_S", 0.05)
+    camera = Camera("http://127.0.0.1:9/")
+    monkeypatch.setattr(camera, "_read", Mock(side_effect=error))
+    with pytest.raises(TroubleError) as raised:
+        await camera.after(0)
+    camera.close()
+    assert (raised.value.status, raised.value.detail) == (503, detail)
 
 
 async def test_a_picture_that_a_server_repeats_is_not_new(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import asyncio
 import socket
+import ssl
 from asyncio import sslproto
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Awaitable, Callable
 from contextlib import ExitStack, asynccontextmanager
 from pathlib import Path
-from typing import cast
+from types import SimpleNamespace
+from typing import Any, cast
 from unittest.mock import Mock
 
 import pytest
@@ -26,11 +28,14 @@ from acsard.web.connections import (
     MAX_OF_TOKEN,
     MAX_WAITING_BYTES,
     UNREAD_S,
+    WRITE_BYTES,
     Connections,
     HttpConnection,
     Places,
 )
 from acsard.web.metrics import Counts
+
+Handler = Callable[[web.BaseRequest], Awaitable[web.StreamResponse]]
 
 
 async def _not_found(request: web.BaseRequest) -> web.Response:
@@ -38,17 +43,18 @@ async def _not_found(request: web.BaseRequest) -> web.Response:
 
 
 @asynccontextmanager
-async def accepting(counts: Counts) -> AsyncIterator[tuple[str, int]]:
+async def accepting(
+    counts: Counts, handler: Handler = _not_found, certificate: Any = None
+) -> AsyncIterator[tuple[str, int]]:
     """Accept connections on loopback, and yield the address."""
     served = Connections(counts)
     with socket.create_server(("127.0.0.1", 0)) as listening:
         listening.setblocking(False)
-        work = asyncio.create_task(served.accept(web.Server(_not_found), listening, None))
+        work = asyncio.create_task(served.accept(web.Server(handler), listening, certificate))
         try:
             yield listening.getsockname()
         finally:
             work.cancel()
-            served.close()
 
 
 async def is_open(reader: asyncio.StreamReader) -> bool:
@@ -87,6 +93,26 @@ async def test_a_connection_beyond_the_limit_is_closed_and_the_next_has_the_plac
         assert counts.refused() == {"crowded": 2}
         for _, each in [*opened, (reader, writer), (late, last)]:
             each.close()
+
+
+async def test_a_client_that_leaves_before_it_is_accepted_ends_no_server(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Or the process may open no more files for a moment."""
+    loop = asyncio.get_running_loop()
+    accept, failures = loop.sock_accept, iter([OSError(24, "Too many open files")])
+
+    async def failing(listening: socket.socket) -> Any:
+        for error in failures:
+            raise error
+        return await accept(listening)
+
+    monkeypatch.setattr(loop, "sock_accept", failing)
+    async with asyncio.timeout(20.0), accepting(Counts()) as (host, port):
+        reader, writer = await asyncio.open_connection(host, port)
+        writer.write(b"GET / HTTP/1.1\r\nHost: localhost\r\n\r\n")
+        assert (await reader.readline()).split()[1] == b"404"
+        writer.close()
 
 
 NO_BODY = Mock(is_eof=lambda: True)
@@ -173,10 +199,69 @@ async def test_requests_behind_the_present_one_are_bounded(more: str) -> None:
         assert owned.aborted() == []
         connection.data_received(request)
         assert owned.aborted() == [connection]
-    connection.transport = Mock()
-    with connection.serving(Mock(is_eof=lambda: False)):  # a body
-        connection.data_received(b"")
+    owned = Owned(1)
+    (connection,) = owned.made
+    connection.data_received(b"POST / HTTP/1.1\r\nHost: r\r\nContent-Length: 500000\r\n\r\n")
+    with connection.serving(Mock(is_eof=lambda: False)):  # a body, which aiohttp limits
+        connection.data_received(bytes(MAX_WAITING_BYTES + 1))
     assert owned.aborted() == []
+
+
+REQUEST = b"GET / HTTP/1.1\r\nHost: r\r\n"
+
+
+@pytest.mark.parametrize(
+    ("sent", "answer"), [(b"", b""), (REQUEST, b""), (REQUEST + b"\r\n", b"HTTP/1.1 404")]
+)
+async def test_a_client_that_sends_no_further_request_in_time_is_disconnected(
+    monkeypatch: pytest.MonkeyPatch, sent: bytes, answer: bytes
+) -> None:
+    """One client sends nothing, one half of a request, and one nothing behind its request."""
+    monkeypatch.setattr(connections, "IDLE_S", 0.02)
+    async with asyncio.timeout(20.0), accepting(Counts()) as (host, port):
+        reader, writer = await asyncio.open_connection(host, port)
+        writer.write(sent)
+        assert (await reader.read())[:12] == answer
+        writer.close()
+
+
+async def test_a_tls_handshake_that_does_not_end_in_time_is_cut_off(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(connections, "HANDSHAKE_S", 0.02)
+    counts = Counts()
+    certificate = SimpleNamespace(context=ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER))
+    async with asyncio.timeout(20.0), accepting(counts, certificate=certificate) as (host, port):
+        reader, writer = await asyncio.open_connection(host, port)
+        assert await reader.read() == b""
+        assert counts.refused() == {"slow": 1}
+        writer.close()
+
+
+async def test_a_client_that_leaves_its_answers_unread_is_disconnected(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """The kernel measures the time, which it gets in ms."""
+    limits, ended = list[int](), asyncio.Event()
+
+    async def large(request: web.BaseRequest) -> web.StreamResponse:
+        assert request.transport is not None
+        own = request.transport.get_extra_info("socket")
+        limits.append(own.getsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT))
+        answer = web.StreamResponse()
+        await answer.prepare(request)
+        try:
+            while True:
+                await answer.write(bytes(WRITE_BYTES))
+        finally:
+            ended.set()
+
+    monkeypatch.setattr(connections, "UNREAD_S", 0.1)
+    async with asyncio.timeout(20.0), accepting(Counts(), large) as (host, port):
+        with socket.create_connection((host, port)) as greedy:
+            greedy.sendall(REQUEST + b"\r\n")
+            await ended.wait()
+    assert limits == [100]
 
 
 def test_the_manual_states_the_limits() -> None:

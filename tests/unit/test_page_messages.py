@@ -50,6 +50,15 @@ def test_each_kind_of_message_is_recognized_by_its_field() -> None:
     assert decode('{"ping": 12.5}') == Ping(12.5)
 
 
+def test_the_stamp_of_a_command_is_in_milliseconds() -> None:
+    frame = decode(json.dumps(COMMAND))
+    assert isinstance(frame, Command)
+    assert frame.stamp_ns == pytest.approx(1763700000123.4 * 1e6, abs=1e5)
+    without = decode(json.dumps({"cmd": COMMAND["cmd"]}))
+    assert isinstance(without, Command)
+    assert without.stamp_ns is None
+
+
 @each("stamp", [9.3e12, 1.8e13, 2.0**51, MAX_STAMP_MS])
 def test_a_stamp_that_no_signature_holds_is_refused(stamp: float) -> None:
     with pytest.raises(FrameError, match="stamp"):

@@ -7,7 +7,7 @@ from prometheus_client.parser import text_string_to_metric_families
 
 from acsard.core.messages.schema import BatterySummary, Latency, RobotState, Spread, Time
 from acsard.core.messages.state_warnings import WARNING_KINDS
-from acsard.web.metrics import Counts, text
+from acsard.web.metrics import MAX_COUNTED_CLIENTS, Counts, text
 
 SPREAD = Spread(10, 5.0, 20.0, 80.0)
 
@@ -110,3 +110,16 @@ def test_each_line_names_the_client_with_the_most_refusals_since_the_last_line()
     assert (event.name, event.level, event.count) == ("page_refused", "warning", 1)
     assert event.text == "1 slow"
     assert counts.new_refusals() is None
+
+
+def test_a_client_of_many_addresses_fills_no_memory_and_hides_no_client_before_it() -> None:
+    counts = Counts()
+    for number in range(MAX_COUNTED_CLIENTS):
+        counts.refuse("role", f"first {number}")
+    for _ in range(2):
+        counts.refuse("role", "first 0")
+        counts.refuse("role", "late")
+    event = counts.new_refusals()
+    assert event is not None
+    assert "3 from first 0" in event.text
+    assert "late" not in event.text

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import threading
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -10,6 +11,7 @@ from typing import Any
 import pytest
 
 from acsard.recording.file import FrameWriter, Head
+from acsard.web import recordings
 from acsard.web.answers import TroubleError
 from acsard.web.callers import RequestRefusedError
 from acsard.web.recordings import BlackBox, Recording, rows
@@ -77,6 +79,18 @@ async def test_recordings_that_cannot_be_read_are_explained(tmp_path: Path) -> N
         for look in (BlackBox(robot).rows(), BlackBox(robot).find("x")):
             with pytest.raises(TroubleError, match=why):
                 await look
+
+
+async def test_a_disk_that_does_not_answer_is_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    released = threading.Event()
+    monkeypatch.setattr(recordings, "READ_TIMEOUT_S", 0.01)
+    monkeypatch.setattr(recordings, "listed", lambda _: [released.wait(20.0)][:0])
+    with pytest.raises(TroubleError, match="the disk does not answer; try again") as raised:
+        await BlackBox(robot_with(str(tmp_path))).rows()
+    released.set()
+    assert raised.value.status == 503
 
 
 def test_a_recording_whose_name_has_no_time_is_listed_without_one(tmp_path: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import math
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -99,9 +100,11 @@ def world(monkeypatch: pytest.MonkeyPatch) -> World:
 
 
 def test_a_robot_that_falls_silent_is_reported_within_its_time(world: World) -> None:
+    world.followed._about_due_s = math.inf
     changes = world.reachability_changes(10.0, lambda t: world.state() if t < 5.0 else None)
     (_, here), (at, reason) = changes
     assert here == ""
+    assert world.followed._about_due_s == 0.0, "its facts may be others now"
     assert "nothing is received from the daemon at tcp/x:1" in reason
     assert (
         4.9 + ROBOT_SILENCE_TIMEOUT_S - PROCESS_PERIOD_S
@@ -122,6 +125,7 @@ def test_a_robot_that_publishes_once_in_ten_seconds_is_queried_and_is_not_gone(
 
 
 def test_a_daemon_of_another_version_is_reported_as_such(world: World) -> None:
+    assert world.followed.gone == "no daemon answers at tcp/x:1 yet"
     ((at, reason),) = world.reachability_changes(10.0, lambda t: UNREADABLE)
     assert "another version" in reason
     assert at <= FIRST_STATE_TIMEOUT_S + 2 * PROCESS_PERIOD_S

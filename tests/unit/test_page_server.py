@@ -6,17 +6,24 @@ import _thread
 import asyncio
 import io
 import os
+import signal
 import socket
+import sys
+from collections.abc import Iterator, Sequence
+from concurrent.futures import Future
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, cast
 
+import aiohttp
 import pytest
+from msgspec.structs import replace
 
 from acsard.bus import certificate_watch
+from acsard.bus.address import Address
 from acsard.bus.tls_files import KEY
 from acsard.cli import main, parser, web
-from acsard.core.config.settings import LogConfig
+from acsard.core.config.settings import Config, LogConfig
 from acsard.host.errors import CertificateError, InUseError, UsageError
 from acsard.host.logs import Log
 from acsard.host.own_identity import own_addresses
@@ -31,8 +38,10 @@ from acsard.web.listen import (
     require_certificate,
 )
 from acsard.web.metrics import Counts
-from acsard.web.page_server import Certificate
+from acsard.web.page_server import Certificate, ServerOptions
 from acsard.web.tokens import ReadTokens, Vault
+from tests.unit.screens import STATE, sample_of
+from tests.unit.test_page_robot import AnsweringRobot
 
 OWN = [*own_addresses(), "203.0.113.9", "2001:db8::9"]
 
@@ -112,6 +121,17 @@ def test_a_port_in_use_is_reported_or_the_next_port_is_used() -> None:
             assert endpoint.port > wished.port
 
 
+def test_a_name_that_no_resolver_knows_is_reported_in_the_words_of_the_system(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def unknown(*_: object, **__: object) -> None:
+        raise socket.gaierror(socket.EAI_NONAME, "Name or service not known")
+
+    monkeypatch.setattr(socket, "getaddrinfo", unknown)
+    with pytest.raises(InUseError, match="https://robot7:8443/: Name or service not known; if"):
+        open_sockets([Listen(True, "robot7", 8443)], next_port=False)
+
+
 @pytest.mark.parametrize("texts", [("0.0.0.0", "[::]"), ("[::]", "127.0.0.1")])
 def test_an_address_at_the_port_of_the_ipv6_wildcard_is_reported(
     texts: tuple[str, str],
@@ -152,6 +172,19 @@ def test_an_invitation_ends_with_the_command_that_revokes_it(
     assert main(command.splitlines()[0].split()) == 0
     assert capsys.readouterr().out == "tv is revoked\n"
     assert Vault(tmp_path / "state", "acsar").all() == []
+
+
+@pytest.mark.parametrize(
+    ("words", "hours"), [((), 30 * 24), (("--days", "3"), 3 * 24), (("--hours", "2"), 2)]
+)
+def test_an_invitation_lasts_for_the_time_that_was_typed(
+    words: tuple[str, ...], hours: int, tls: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("STATE_DIRECTORY", str(tmp_path / "state"))
+    address = ["--address", "https://0.0.0.0:8443"]
+    assert main(["web", "--tls", tls, *address, "invite", "viewer", *words]) == 0
+    (token,) = Vault(tmp_path / "state", "acsar").all()
+    assert token.ends - token.made == hours * 3600
 
 
 async def test_one_thread_waits_for_a_hanging_disk_and_then_everything_is_read_again(
@@ -231,3 +264,87 @@ async def test_the_connections_of_a_revoked_token_end_with_the_reading_that_miss
     finally:
         ticking.cancel()
         log.close()
+
+
+@pytest.fixture
+def served(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[ServerOptions]:
+    """Return the options of a server whose robot answers."""
+    client = AnsweringRobot(failures=0)
+    client.queue.append(sample_of(STATE))
+    monkeypatch.setattr(page_server, "_connected", lambda _: client)
+    monkeypatch.setattr(page_server, "TICK_S", 0.01)
+    monkeypatch.setattr(os, "nice", lambda _: 0)
+    monkeypatch.setattr(page_server, "end_with_parent", lambda _: None)
+    before = sys.getswitchinterval()
+    where = Address("tcp/127.0.0.1:1", "acsar", "")
+    listen = (Listen(False, "127.0.0.1", free_port()),)
+    yield ServerOptions(Config(), where, listen, "", tmp_path / "state")
+    sys.setswitchinterval(before)
+
+
+async def fetched(listen: Sequence[Listen]) -> int:
+    async with aiohttp.ClientSession() as session, session.get(listen[0].url) as answer:
+        return answer.status
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+async def test_a_signal_ends_the_server_of_the_page_and_its_websockets(
+    number: signal.Signals, served: ServerOptions
+) -> None:
+    log, ready = Log(LogConfig(), io.StringIO()), asyncio.Queue[Sequence[Listen]]()
+    serving = asyncio.create_task(page_server.serve(served, ready.put_nowait, log))
+    async with asyncio.timeout(20.0):
+        listen = await ready.get()
+        assert list(listen) == list(served.listen)
+        assert await fetched(listen) == 200
+        async with (
+            aiohttp.ClientSession() as session,
+            session.ws_connect(f"{listen[0].url}ws") as theirs,
+        ):
+            os.kill(os.getpid(), number)
+            while (message := await theirs.receive()).type == aiohttp.WSMsgType.TEXT:
+                pass
+        assert message.extra == "the page's server ends"
+        await serving
+    assert not reached(listen[0].port, listen[0].host)
+    log.close()
+
+
+async def test_the_server_of_the_page_ends_with_the_daemon_that_started_it(
+    served: ServerOptions, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    log, ready = Log(LogConfig(), io.StringIO()), asyncio.Queue[Sequence[Listen]]()
+    daemon, child = socket.socketpair()
+    monkeypatch.setattr(sys, "stdin", child)
+    options = replace(served, supervised=True)
+    serving = asyncio.create_task(page_server.serve(options, ready.put_nowait, log))
+    async with asyncio.timeout(20.0):
+        assert await fetched(await ready.get()) == 200
+        assert daemon.recv(1) == b"."  # a sign of life
+        assert not serving.done()
+        daemon.close()
+        await serving
+    log.close()
+    child.close()
+
+
+@pytest.mark.parametrize("part", ["task", "outbox"])
+async def test_an_error_of_a_part_ends_the_server_with_that_error(part: str) -> None:
+    cancelled, outbox = asyncio.Event(), SimpleNamespace(dead=Future[None]())
+
+    async def waits() -> None:
+        try:
+            await asyncio.sleep(60.0)
+        finally:
+            cancelled.set()
+
+    async def fails() -> None:
+        if part == "outbox":
+            outbox.dead.set_exception(UsageError("it fails"))
+            await asyncio.sleep(60.0)
+        raise UsageError("it fails")
+
+    with pytest.raises(UsageError, match="it fails"):
+        await page_server.first_ended([waits(), fails()], cast(Any, outbox))
+    async with asyncio.timeout(20.0):
+        await cancelled.wait()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+import time
 from collections.abc import AsyncIterator, Callable
 from types import SimpleNamespace
 from typing import Any, cast
@@ -15,7 +16,7 @@ import pytest
 from aiohttp.test_utils import make_mocked_request
 
 from acsard.bus.address import Address
-from acsard.core.messages.schema import Beat, ServiceReply
+from acsard.core.messages.schema import ServiceReply
 from acsard.core.values import Role
 from acsard.web.callers import AdmittedClient
 from acsard.web.followed_robot import About, FollowedRobot
@@ -65,6 +66,77 @@ async def test_a_beat_is_sent_as_it_arrives_and_ahead_of_everything_that_waits()
     assert [said.get("key", "") for said in socket.sent] == ["beat", "", "", "beat", ""]
 
 
+async def test_a_beat_that_arrives_while_other_values_are_sent_is_sent_once() -> None:
+    socket: Any = Socket()
+    request: Any = SimpleNamespace(transport=None)
+    out = Outgoing(socket, request, Streams(), Counts(), "")
+    for key in ("events", "beat"):
+        out.subscribe(key, 50.0)
+    streams = {key: one.stream for key, one in out.following.items()}
+    payload = SimpleNamespace(to_bytes=lambda: b'{"run":7,"boot_us":1}')
+    sample = cast(Any, SimpleNamespace(encoding="application/json", payload=payload))
+    streams["events"].take(sample)
+    looks = 0
+
+    def arrive() -> None:
+        if len(socket.sent) == 1:
+            streams["beat"].take(sample)
+
+    def look_around(now: float) -> float:
+        nonlocal looks
+        looks += 1
+        return now
+
+    socket.between = arrive
+    pump = asyncio.create_task(out.pump(look_around))
+    await wait_until(lambda: looks >= 3)
+    pump.cancel()
+    assert [said["key"] for said in socket.sent] == ["events", "beat"]
+
+
+async def test_messages_that_a_client_does_not_read_fill_no_memory() -> None:
+    """It may ask for much, such as a pong for each ping, and read nothing."""
+    out = Outgoing(cast(Any, None), REQUEST, STREAMS, Counts(), "")
+    for number in range(1000):
+        out.enqueue(number)
+    assert [int(data) for data, _ in out._out] == list(range(800, 1000))
+
+
+async def test_of_two_calls_the_second_is_refused_until_the_first_is_answered() -> None:
+    page, answered = Page("maintainer"), asyncio.Event()
+
+    async def call(who: object, verb: str, payload: object) -> ServiceReply:
+        await answered.wait()
+        return ServiceReply(True, verb)
+
+    page.viewer._calls.call = call  # type: ignore[method-assign, assignment]
+    for number in (1, 2):
+        await page.take(json.dumps({"call": "clear", "id": number}))
+    await asyncio.sleep(0)
+    answered.set()
+    await wait_until(lambda: len(page.viewer._out._out) == 2)
+    said = [json.loads(text) for text, _ in page.viewer._out._out]
+    assert [(one["answer"], one["ok"]) for one in said] == [(2, False), (1, True)]
+    assert page.counts.refused() == {"too_fast": 1}
+    await page.take('{"call": "clear", "id": 3}')
+    await wait_until(lambda: len(page.viewer._out._out) == 3)
+
+
+async def test_a_ping_of_the_protocol_is_answered_with_its_data() -> None:
+    page = Page("viewer")
+    page.viewer._take(cast(Any, SimpleNamespace(type=aiohttp.WSMsgType.PING, data=b"7")))
+    assert list(page.viewer._out._out) == [(b"7", aiohttp.WSMsgType.PONG)]
+
+
+async def test_a_ping_is_answered_with_the_wall_clock_in_milliseconds() -> None:
+    page = Page("viewer")
+    await page.take('{"ping": 12.5}')
+    ((text, _),) = page.viewer._out._out
+    said = json.loads(text)
+    assert said["pong"] == 12.5
+    assert abs(said["now"] / 1e3 - time.time()) < PATIENCE_S
+
+
 async def wait_until(condition: Callable[[], bool]) -> None:
     async with asyncio.timeout(5.0):
         while not condition():
@@ -72,49 +144,6 @@ async def wait_until(condition: Callable[[], bool]) -> None:
 
 
 PATIENCE_S = 20.0
-
-
-@pytest.mark.slow
-async def test_a_zero_is_obeyed_beyond_the_limit_on_messages() -> None:
-    """A burst of messages, for example after a gap of the network, must not prevent the zero."""
-    put: list[tuple[float, str]] = []
-
-    class Fake:
-        certificate, session = "", None
-
-        def put(self, twist: Any, signature: Any, source: str) -> None:
-            put.append((twist.linear.x, source))
-            assert signature.echo == Beat(7, 1)
-
-    counts = Counts()
-    about = About("1", True, 1.0, 4.0, 10.0, "", {"slow": 10.0})
-    fake: Any = Fake()
-    robot = FollowedRobot(Address("tcp/127.0.0.1:1", "acsar", ""), lambda: fake, about, counts)
-    robot.client = fake
-    parts = Parts(robot, counts)
-    request: Any = SimpleNamespace(transport=None)
-    socket: Any = SimpleNamespace()
-    viewer = Viewer(
-        socket, request, AdmittedClient("operator", "bob", "token", "1.2.3.4"), parts, camera=False
-    )
-
-    def take(frame: dict[str, Any]) -> None:
-        message: Any = SimpleNamespace(type=aiohttp.WSMsgType.TEXT, data=json.dumps(frame))
-        viewer._take(message)
-
-    def drive(speed: float) -> None:
-        wish = {"linear_x": speed, "angular_z": 0.0}
-        beat = {"run": 7, "boot_us": 1}
-        take({"cmd": wish, "source": "slow", "echo": beat})
-
-    drive(0.5)
-    parts.outbox.flush(PATIENCE_S)
-    for number in range(700):
-        take({"ping": number})
-    drive(0.5)
-    drive(0.0)
-    parts.outbox.flush(PATIENCE_S)
-    assert put == [(0.5, "slow"), (0.0, "slow")]
 
 
 class Page:
@@ -142,6 +171,66 @@ class Page:
         self.viewer._take(message)
         if self.viewer._stopping is not None:
             await self.viewer._stopping
+
+
+@pytest.mark.parametrize(
+    ("frame", "is_obeyed"),
+    [
+        ('{"cmd": {"linear_x": 0, "angular_z": 0}, "source": "app"}', True),
+        ('{"call": "stop"}', True),
+        ('{"cmd": {"linear_x": 0.5, "angular_z": 0}, "source": "app"}', False),
+        ('{"call": "clear"}', False),
+        ('{"ping": 1}', False),
+    ],
+)
+async def test_beyond_the_limit_on_messages_only_a_zero_and_a_stop_are_obeyed(
+    frame: str, is_obeyed: bool
+) -> None:
+    """A burst of messages, for example after a gap of the network, must not prevent them."""
+    page, obeyed = Page("maintainer"), list[object]()
+    page.viewer._rate = Mock(take=lambda *_: False)
+    page.viewer._obey = obeyed.append  # type: ignore[method-assign, assignment]
+    await page.take(frame)
+    assert bool(obeyed) == is_obeyed
+    assert page.counts.refused() == {"too_fast": 1}
+    assert page.viewer._ending is not None
+    await page.viewer._ending
+
+
+async def test_a_client_that_must_leave_gets_the_reason_and_a_second_to_read_it(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    frame, transport, later = AsyncMock(), Mock(), list[Any]()
+    socket: Any = SimpleNamespace(send_frame=frame)
+    request: Any = SimpleNamespace(transport=transport)
+    out = Outgoing(socket, request, STREAMS, Counts(), "")
+    loop = asyncio.get_running_loop()
+    monkeypatch.setattr(loop, "call_later", lambda delay, *call: later.append((delay, *call)))
+    await out.close("your token has expired")
+    monkeypatch.undo()
+    frame.assert_awaited_once_with(
+        b"\x03\xf0your token has expired",
+        aiohttp.WSMsgType.CLOSE,  # 1008, policy violation
+    )
+    [(delay, call, *words)] = later
+    assert delay == 1.0
+    transport.abort.assert_not_called()
+    call(*words)
+    transport.abort.assert_called_once_with()
+
+
+async def test_a_silent_daemon_is_reported_once_and_its_new_facts_as_they_come() -> None:
+    page = Page("viewer")
+    for _ in range(2):
+        page.viewer._look_around(0.0)
+    said = [json.loads(text) for text, _ in page.viewer._out._out]
+    assert said == [{"gone": "no daemon answers at tcp/127.0.0.1:1 yet"}]
+    page.viewer._out._out.clear()
+    for version in ("2", "2", "3"):
+        page.viewer._robot.about = msgspec.structs.replace(page.viewer._about, version=version)
+        page.viewer._look_around(0.0)
+    said = [json.loads(text) for text, _ in page.viewer._out._out]
+    assert [each["hello"]["version"] for each in said] == ["2", "3"]
 
 
 @pytest.mark.parametrize("role", ["viewer", "maintainer"])

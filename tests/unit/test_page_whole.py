@@ -20,9 +20,13 @@ from yarl import URL
 from acsard.bus.address import Address
 from acsard.bus.zenoh_sessions import MAX_MESSAGE_BYTES
 from acsard.core.config.settings import WebConfig
+from acsard.core.messages.encodings import DecodeError
+from acsard.host import clock
+from acsard.host.errors import NoAnswerError, UsageError
 from acsard.web.answers import unsent_bytes
 from acsard.web.app import Page
-from acsard.web.connections import MAX_WAITING_BYTES, Connections
+from acsard.web.camera import Picture
+from acsard.web.connections import MAX_WAITING_BYTES, Connections, HasContext
 from acsard.web.followed_robot import About, FollowedRobot
 from acsard.web.metrics import Counts
 from acsard.web.socket_sender import MAX_UNREAD_BYTES
@@ -49,20 +53,31 @@ class Whole:
             Address("tcp/127.0.0.1:1", "acsar", ""), Mock(), ABOUT, self.counts
         )
         self.parts, self.connections = Parts(self.robot, self.counts), Connections(self.counts)
-        tokens = ReadTokens(Vault(where, "acsar"))
-        self.page = Page(self.parts, tokens, frozenset(), self.connections, rules)
+        self.vault = Vault(where, "acsar")
+        self.tokens = ReadTokens(self.vault)
+        names = frozenset({"robot.local"})
+        self.page = Page(self.parts, self.tokens, names, self.connections, rules)
 
     @asynccontextmanager
-    async def served(self) -> AsyncIterator[tuple[URL, aiohttp.ClientSession]]:
-        """Serve the page on loopback, and yield its URL and a client."""
+    async def served(
+        self, certificate: HasContext | None = None
+    ) -> AsyncIterator[tuple[URL, aiohttp.ClientSession]]:
+        """Serve the page on loopback, and yield its URL and a client.
+
+        With a certificate, the client uses HTTPS and the robot's name, like another machine.
+        """
+        scheme, headers = ("https", {"Host": "robot.local"}) if certificate else ("http", {})
         runner = web.AppRunner(self.page.app, handle_signals=False, shutdown_timeout=0.1)
         await runner.setup()
         assert runner.server is not None
         with socket.create_server(("127.0.0.1", 0)) as listening:
             listening.setblocking(False)
-            accepting = asyncio.create_task(self.connections.accept(runner.server, listening, None))
-            async with aiohttp.ClientSession() as session:
-                yield URL(f"http://127.0.0.1:{listening.getsockname()[1]}"), session
+            accepting = asyncio.create_task(
+                self.connections.accept(runner.server, listening, certificate)
+            )
+            connector = aiohttp.TCPConnector(ssl=False)
+            async with aiohttp.ClientSession(connector=connector, headers=headers) as session:
+                yield URL(f"{scheme}://127.0.0.1:{listening.getsockname()[1]}"), session
             accepting.cancel()
         await runner.cleanup()
 
@@ -140,7 +155,9 @@ async def test_a_client_on_the_robot_has_the_role_of_the_configuration(tmp_path:
     whole = Whole(tmp_path, WebConfig(local="operator"))
     async with whole.hands() as ours:
         hello = (await ours.find(lambda frame: "hello" in frame))["hello"]
-        assert hello["role"] == "operator"
+        assert (hello["robot"], hello["version"], hello["role"]) == ("acsar", "1", "operator")
+        assert (hello["limits"], hello["simulated"]) == ({"linear": 1.0, "angular": 4.0}, True)
+        assert (hello["state_rate"], hello["camera"]) == (10.0, False)
         assert "set" in hello["barred"]
         assert not (await ours.call("set", settings={}))["ok"]
     assert whole.counts.refused() == {"role": 1}
@@ -252,6 +269,30 @@ async def test_a_path_called_with_another_method_names_the_method_it_accepts(who
             assert (await answer.json())["error"] == "this path accepts only POST"
         async with session.post(url / "api/nothing") as answer:
             assert answer.status == 404
+        async with session.post(url / "api/srv/set", data=bytes(MAX_MESSAGE_BYTES + 1)) as answer:
+            assert answer.status == 413
+        assert whole.counts.refused() == {"path": 2, "too_big": 1}
+
+
+@pytest.mark.parametrize(
+    ("sent", "reason", "words"),
+    [
+        (b"GET / HTTP/1.1\r\n\r\n", "host", b"which must name the robot"),
+        (b"\x16\x03\x01\x02\r\n\r\n", "malformed", b"bytes that are not an HTTP request"),
+    ],
+)
+async def test_bytes_that_are_no_request_are_answered_counted_and_end_the_connection(
+    whole: Whole, sent: bytes, reason: str, words: bytes
+) -> None:
+    async with whole.served() as (url, _), asyncio.timeout(PATIENCE_S):
+        reader, writer = await asyncio.open_connection(url.host, url.port)
+        writer.write(sent)
+        answer = await reader.read()
+        assert answer.split()[1] == b"400"
+        assert words in answer
+        assert b"X-Content-Type-Options: nosniff" in answer
+        assert whole.counts.refused() == {reason: 1}
+        writer.close()
 
 
 async def test_an_ordinary_request_for_the_websocket_is_told_what_the_address_is(
@@ -378,3 +419,51 @@ async def test_a_viewer_that_drives_and_goes_away_leaves_a_zero(whole: Whole, ab
             await ours.socket.close()
         await eventually(lambda: driven.speeds[-1] == 0.0)
     assert driven.speeds == [0.0, 0.5, 0.0]
+
+
+@pytest.mark.parametrize(
+    ("error", "status", "words"),
+    [
+        (None, 503, "no daemon answers at tcp/127.0.0.1:1 yet"),
+        (NoAnswerError("nobody answers"), 504, "no daemon answers at tcp/127.0.0.1:1 yet"),
+        (UsageError("there is no such key"), 503, "there is no such key"),
+        (DecodeError("malformed", "it is not JSON"), 503, "it is not JSON"),
+        (TimeoutError(), 503, "the robot did not answer in time: try again"),
+    ],
+)
+async def test_a_value_that_the_robot_does_not_give_is_answered_with_the_reason(
+    whole: Whole, error: Exception | None, status: int, words: str
+) -> None:
+    whole.robot.client = cast(Any, error and Mock(reply=Mock(side_effect=error)))
+    async with whole.served() as (url, session), session.get(url / "api/state") as answer:
+        assert (answer.status, (await answer.json())["error"]) == (status, words)
+
+
+async def test_the_age_of_a_picture_and_the_wait_for_it_are_in_milliseconds(
+    whole: Whole, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    now_ns = 5_000_000_000
+
+    async def after(number: int) -> Picture:
+        nonlocal now_ns
+        now_ns += 300_000_000
+        return Picture(b"", number + 1, 1_000_000_000)
+
+    monkeypatch.setattr(clock, "steady_ns", lambda: now_ns)
+    whole.page._camera.after = after  # type: ignore[method-assign]
+    for tag, number in (("", "1"), ("7", "8"), ("seven", "1"), (16 * "7", "1")):
+        async with whole.served() as (url, session):
+            known = {"If-None-Match": f'"{tag}"'}
+            now_ns = 5_000_000_000
+            async with session.get(url / "api/camera", headers=known) as answer:
+                assert answer.headers["ETag"].strip('"') == number
+                times = answer.headers["Age-Ms"], answer.headers["Waited-Ms"]
+                assert times == ("4300", "300")
+
+
+async def test_a_viewer_that_goes_away_ends_its_subscriptions(whole: Whole) -> None:
+    async with whole.hands() as ours:
+        await ours.say(subscribe="odom", rate=10)
+        await eventually(lambda: whole.robot.streams._streams)
+    (stream,) = whole.robot.streams._streams.values()
+    await eventually(lambda: stream.users == 0)

@@ -86,6 +86,9 @@ def heads_of(paths: list[Path]) -> list[Head]:
 def test_heads_and_files_begin_after_their_times_and_each_file_replays_alone(
     bench: Bench, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    page = Path(__file__).parents[2] / "deploy/manual/pages/reference/recordings.md"
+    assert "ends after an hour" in page.read_text(encoding="utf-8")
+    assert module.FILE_NS == 3600 * NS_PER_S
     for name, seconds in (("HEAD_NS", 2), ("SYNC_NS", 1), ("FILE_NS", 5)):
         monkeypatch.setattr(module, name, seconds * NS_PER_S)
     bench.recorder._head_ns -= 18 * NS_PER_S

@@ -18,12 +18,13 @@ from typing import Any
 import pytest
 from msgspec.structs import replace
 
+from acsard.core.codes import Reason
 from acsard.core.config.settings import Config, RecordConfig
 from acsard.core.guard import Guard
 from acsard.core.robot import Robot
 from acsard.core.values import NS_PER_S, Event, Instant
 from acsard.recording import recorder
-from acsard.recording.file import SUFFIX, Recording, listed
+from acsard.recording.file import SUFFIX, Recording, Waits, listed
 from acsard.recording.recorder import Recorder
 from tests.unit.drives import drive
 
@@ -188,6 +189,15 @@ def test_steps_that_a_full_disk_refused_are_counted_exactly(room: int, box: Box)
         box.record(9)
         assert box.trouble.endswith("File too large") == (room < 200_000)
     box.record(7)
+    assert box.trouble == ""
+    box.end()
+
+
+def test_a_source_that_waits_while_the_disk_refuses_ends_no_recording(box: Box) -> None:
+    with failing("open"):
+        box.recorder._queue.append(Waits.of(STEP.now, {"teleop": Reason("higher", "app drives")}))
+        box.record(1)
+    box.record(recorder.RETRY_ROUNDS + 3)
     assert box.trouble == ""
     box.end()
 

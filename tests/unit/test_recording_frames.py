@@ -13,8 +13,9 @@ from typing import Any
 import msgspec
 import pytest
 import zstandard
+from msgspec.structs import replace
 
-from acsard.core.values import Instant, Request
+from acsard.core.values import Instant, Received, Request
 from acsard.host.errors import RecordingError
 from acsard.recording import file as recording_file
 from acsard.recording.file import MAGIC, SUFFIX, FrameWriter, Head, Recording, encode_steps, listed
@@ -72,6 +73,19 @@ def test_every_step_is_read_as_it_was_written(tmp_path: Path) -> None:
         assert step.recorded.events == entry.news.events
     assert [step.number for step in steps if step.begins] == list(range(0, len(TAKEN), SECOND))
     assert recording.head() == head(0, TAKEN[0].now)
+
+
+def test_each_read_of_the_port_has_its_own_time(tmp_path: Path) -> None:
+    """The first steps behind an open port have the bytes from which the line is recognized."""
+    entry, path = TAKEN[7], tmp_path / "a"
+    now = entry.now
+    reads = tuple(
+        Received(Instant(now.mono_ns - early_ns, now.wall_ns - early_ns + set_ns), b"ap")
+        for early_ns, set_ns in ((3_000_000, 500), (1_000_000, 0))
+    )
+    path.write_bytes(write([entry._replace(heard=replace(entry.heard, received=reads))]))
+    (step,) = Recording([path]).steps()
+    assert step.heard.received == reads
 
 
 def test_steps_that_are_too_many_for_one_record_are_in_several(

@@ -203,6 +203,16 @@ def test_every_event_has_a_row_with_the_client_that_caused_it() -> None:
     assert any("(by unnamed (native))" in word for word in words)
     marks = [mark for level in LEVELS for mark in traces(text, level) if "yaxis" in mark]
     assert sum(len(mark["x"]) for mark in marks) == len(logs)
+    told = marks[0]["yaxis"].replace("y", "yaxis")
+    axis = pictures(text)["time"]["layout"][told]
+    assert (axis["categoryarray"], axis["range"]) == ([*LEVELS], [len(LEVELS) - 0.5, -0.5])
+
+
+def test_the_name_of_an_event_is_in_words() -> None:
+    text = report([event("it rolls", "wheel_fault")], "acsar", [])
+    (mark,) = [mark for mark in traces(text, "info") if mark["x"]]
+    assert "wheel fault" in mark["hovertext"][0]
+    assert "wheel fault" in PageElements(text).words
 
 
 def test_of_too_many_events_the_newest_are_shown_and_those_of_several_days_have_a_date() -> None:
@@ -235,6 +245,9 @@ def test_the_curves_are_the_messages(wheels: WheelMap, names: tuple[str, ...]) -
     path = traces(text, "path")[0]
     place = [item for item in drive if item.channel.native == "odom"][-1].message
     assert path["x"][-1] == pytest.approx(place.pose.pose.position.x, abs=1e-5)
+    for name, row in (("start", 0), ("end", -1)):
+        (mark,) = traces(text, name)
+        assert (mark["x"], mark["y"]) == ([path["x"][row]], [path["y"][row]])
     axis = traces(text, names[0])[0]["yaxis"]
     curves = [t for t in pictures(text)["time"]["data"] if t.get("yaxis") == axis]
     assert tuple(curve["name"] for curve in curves) == names
@@ -242,6 +255,18 @@ def test_the_curves_are_the_messages(wheels: WheelMap, names: tuple[str, ...]) -
     received = traces(text, "lines received")[0]["y"][1:]
     assert received == pytest.approx([100.0] * len(received), abs=2)
     assert len(received) >= 3
+
+
+def test_the_counters_of_a_daemon_that_started_anew_are_no_negative_rates() -> None:
+    first, *_ = states()
+    messages = []
+    for second, (sent, missed) in enumerate([(100, 5), (200, 5), (50, 6), (150, 6)]):
+        counters = {"lines_sent": sent, "missed_periods": missed}
+        state = replace(first.message, counters=counters)
+        at_ns = first.wall_ns + second * NS_PER_S
+        messages.append(Published(first.channel, first.source, at_ns, state))
+    (rates,) = traces(report(messages, "acsar", []), "lines sent")
+    assert rates["y"] == [100.0, 100.0]
 
 
 def test_a_robot_that_got_other_wheels_has_the_curves_of_the_last_ones() -> None:
@@ -257,6 +282,9 @@ def test_the_bands_say_who_drives_and_why_another_waits() -> None:
     (drives,), (waits,) = traces(text, "drives"), traces(text, "waits")
     assert drives["y"] == ["teleop", "nav"]
     assert drives["base"][1] < drives["base"][0]
+    driven = [item for item in drive_of_two() if item.channel.native == "cmd_vel_out"]
+    seconds = (driven[-1].wall_ns - driven[0].wall_ns) / NS_PER_S
+    assert 0.2 * seconds < sum(drives["x"]) / 1000 <= seconds
     texts = dict(zip(waits["y"], waits["hovertext"], strict=True))
     assert "teleop has priority" in texts["nav"].replace("<br>", " ")
     modes = {t["name"] for t in pictures(text)["time"]["data"] if "mode" in t["y"]}
@@ -284,6 +312,9 @@ def test_a_command_far_out_of_range_does_not_flatten_the_other_curves() -> None:
     assert traces(text, "commanded by nav")[0]["y"][-1] == 1e300
     low, high = pictures(text)["time"]["layout"]["yaxis"]["range"]
     assert -1 < low < high < 1
+    drawn = traces(text, "measured")[0]["y"] + traces(text, "limited")[0]["y"]
+    room = (max(drawn) - min(drawn)) / 2
+    assert (low, high) == pytest.approx((min(drawn) - room, max(drawn) + room), abs=1e-4)
 
 
 @pytest.mark.parametrize("count", [1, MAX_ROWS, MAX_ROWS + 1, 100_000])

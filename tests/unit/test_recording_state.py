@@ -20,6 +20,7 @@ from acsard.core.guard import Memory
 from acsard.core.robot import Robot
 from acsard.core.robot_memory import State
 from acsard.core.summary import summary
+from acsard.core.values import NS_PER_S
 from acsard.recording.file import Recording
 from acsard.recording.replay import Playback
 from acsard.recording.state import (
@@ -141,6 +142,9 @@ def test_a_robot_of_another_layout_is_replaced_by_a_fresh_one_where_it_rests(
     assert 100 < len(steps) < len(tape.taken) - first - 100
     (note,) = map(str, recording.damage)
     assert re.match(r"\d\.\d s cannot be replayed: acsard .* in another layout, and a fresh", note)
+    unread_s = (steps[0].now.mono_ns - tape.taken[first].now.mono_ns) / NS_PER_S
+    assert unread_s > 0.1
+    assert float(note.split()[0]) == pytest.approx(unread_s, abs=0.06)
     recorded, replayed = playback.comparison.end or ((0, 0, 0), (1, 1, 1))
     assert recorded == pytest.approx(replayed, abs=1000)
     assert playback.robot.state.odometry.pose.x > 0.8

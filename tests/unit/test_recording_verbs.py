@@ -2,19 +2,23 @@
 
 from __future__ import annotations
 
+import io
 import json
 import os
+import sys
 import time
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
 import pytest
 from msgspec.structs import replace
 
+from acsard.cli import parser
 from acsard.core.values import Event
 from acsard.host.errors import Exit
 from acsard.host.version import version
-from acsard.recording.file import Head
+from acsard.recording.file import Head, first_head
 from tests.scenarios.taped import Tape
 from tests.scenarios.world import START, World
 from tests.system.typed import typed
@@ -172,5 +176,99 @@ def test_a_replay_names_another_version_that_recorded(where: Path, tmp_path: Pat
         assert (code, told in out) == (0, own != version())
 
 
+@pytest.mark.parametrize("verb", ["show", "replay", "report", "export"])
+def test_a_time_or_a_directory_that_cannot_be_used_is_refused(
+    where: Path, tmp_path: Path, verb: str
+) -> None:
+    new = [str(tmp_path / "new.mcap")] if verb == "export" else []
+    code, _, err = log(where, verb, "1", *new, "--from", "yesterdy")
+    assert (code, "yesterdy" in err) == (Exit.USAGE, True)
+    code, _, err = log(tmp_path / "none", verb, "1", *new)
+    assert (code, "the directory does not exist" in err) == (1, True)
+
+
+def test_the_list_names_the_recordings_that_cannot_be_read(where: Path, tmp_path: Path) -> None:
+    (tmp_path / name(1)).write_bytes((where / name(1)).read_bytes())
+    (tmp_path / name(2)).write_bytes(b"no recording")
+    for number in (3, 4):
+        (tmp_path / name(number)).touch()
+
+    def opened(path: Path) -> Head | None:
+        if path.name == name(3):
+            raise OSError(5, "Input/output error")
+        if path.name == name(4):
+            raise FileNotFoundError  # the daemon has deleted it
+        return first_head(path)
+
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr("acsard.cli.recording.first_head", opened)
+        code, out, _ = log(tmp_path)
+    rows = out.splitlines()
+    assert code == 0
+    assert [row.split()[0] for row in rows] == [name(1), name(2), name(3)]
+    assert rows[1].endswith("the beginning cannot be read")
+    assert rows[2].endswith("cannot be read: Input/output error")
+
+
+def test_a_replay_with_another_configuration_says_what_the_robot_would_have_done(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, approved: Callable[[Path, str], None]
+) -> None:
+    """The second configuration is so different that the replayed robot has a fault."""
+    monkeypatch.setattr("acsard.cli.recording.version", lambda: "0.2.0")  # of the tape
+    tape, other, text = Tape(), tmp_path / "other.toml", ""
+    world = World(recorder=tape)
+    world.drive(0.5, seconds=1.0)
+    world.run(0.5)
+    tape.save(tmp_path / name(1))
+    for settings in (
+        "[rates]\nodom = 5.0\n",
+        "[limits]\nlinear_speed = 0.3\n",
+        "[drive]\nwheel_radius = 0.12\n[limits]\nwheel_speed = 2.0\n",
+    ):
+        other.write_text(settings)
+        code, out, err = log(tmp_path, "replay", "1", "--config", str(other))
+        assert (code, err) == (0, "")
+        text += f"--- {' '.join(settings.split())}\n{out}\n"
+    approved(Path(__file__).with_name("words") / "replay.txt", text)
+
+
 def versioned(own: str, _: str, *fields: object) -> Head:
     return Head(own, *fields)  # type: ignore[arg-type]
+
+
+def test_a_recording_that_does_not_exist_is_named(where: Path, tmp_path: Path) -> None:
+    advice = "`acsard recording` lists the recordings"
+    code, _, err = log(where, "show", "7")
+    assert (code, err) == (1, f"acsard: no recording 7 in {where}; {advice}")
+    code, _, err = log(tmp_path, "show")
+    assert (code, err) == (1, f"acsard: no recording in {tmp_path}; {advice}")
+
+
+@pytest.mark.parametrize("verb", ["report", "export"])
+def test_a_file_that_cannot_be_written_ends_with_the_reason(
+    where: Path, tmp_path: Path, verb: str
+) -> None:
+    new = tmp_path / "none" / ("new.html" if verb == "report" else "new.mcap")
+    code, out, err = log(where, verb, "1", str(new))
+    assert (code, out) == (Exit.FAILURE, "")
+    assert f"cannot write {new}: No such file or directory" in err
+
+
+class Terminal(io.StringIO):
+    def isatty(self) -> bool:
+        return True
+
+
+def test_a_long_reading_shows_on_a_terminal_how_far_it_is(
+    where: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("acsard.cli.recording.PROGRESS_RECORDS", 100)
+    errors = Terminal()
+    with monkeypatch.context() as patched:
+        patched.setattr(sys, "stderr", errors)
+        args = parser(["recording"]).parse_args(["recording", "replay", str(where / name(1))])
+        assert args.main(args) == 0
+    *times, end = errors.getvalue().split("\r")[1:]
+    assert end == "\x1b[K"
+    assert 1 <= len(times) <= STEPS // 100 + 2
+    assert times[0] == local(0.0)[:19]
