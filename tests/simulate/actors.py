@@ -123,7 +123,7 @@ class Run:
         self.half_duplex = HalfDuplex()
         self.followed, self.course = Followed(self.witness), Course(self.witness)
         self.wheels = Wheels(self.witness, lambda: self.product.state())
-        self.excess = Excess(self.witness)
+        self.excess = Excess(self.witness, lambda: self.product.state())
         self.causes = Causes()
         self.counts: Counter[str] = self.witness.counts
         self.liveness = Liveness(self)

@@ -88,7 +88,9 @@ class Hang:
 class PoseWitness:
     """Compares the estimated poses with the true ones.
 
-    The comparison starts at an anchor, a sample at which both poses count as equal.
+    The comparison starts at an anchor, a sample at which both poses count as equal. The covariance
+    is that of the pose since the daemon's start, so that of the anchor counts, too: a way back
+    makes the pose more certain, and less certain what it was at the anchor.
     """
 
     def __init__(self, config: dict[str, Any]) -> None:
@@ -132,6 +134,8 @@ class PoseWitness:
         self._drifts = sure and self._seldom
         self._true: deque[tuple[int, Pose]] = deque(maxlen=400)
         self._anchor: tuple[Pose, Pose] | None = None
+        self._anchor_m = self._anchor_rad = 0.0
+        """Deviations of the position and of the heading at the anchor."""
         self._gyro = bool(rates.get("gyro"))
         self._hang: Hang | None = None
         """The present hang of the gyro."""
@@ -226,8 +230,8 @@ class PoseWitness:
             self._driven_ns += now_ns - self._seen_ns
         self._seen_ns = now_ns
         lies = not LIARS.isdisjoint(faults) or now_ns < self._known_ns
-        lies |= self._miscounts and self._driven_ns < MISCOUNTS_NS
-        silent_only = not lies or faults & LIARS == {"mute"}
+        counted = not self._miscounts or self._driven_ns >= MISCOUNTS_NS
+        silent_only = faults & LIARS == {"mute"} if lies else counted
         if lies:
             self.doubt(silent_only)
         if self._spoils_pose(now_ns):
@@ -239,7 +243,8 @@ class PoseWitness:
             # A sum is finite only if each of its numbers is.
             if not math.isfinite(ex + ey + eyaw + sum(covariance)):
                 raise BrokenError("the pose is finite", now_ns, f"{ex} {ey} {eyaw} {covariance}")
-            self._judge_pose(now_ns, sampled_ns + offset_ns, (ex, ey, eyaw), covariance, lies)
+            at_pose = (ex, ey, eyaw)
+            self._judge_pose(now_ns, sampled_ns + offset_ns, at_pose, covariance, lies, counted)
         sampled_ns, ex, ey, eyaw, covariance, _ = estimates[-1]
         self.latest = ex, ey, eyaw
         if silent_only:
@@ -261,8 +266,9 @@ class PoseWitness:
         return placed
 
     def _judge_pose(
-        self, now_ns: int, at_ns: int, pose: Pose, covariance: tuple[float, ...], lies: bool
-    ) -> None:
+        self, now_ns: int, at_ns: int, pose: Pose, covariance: tuple[float, ...], lies: bool,
+        counted: bool,
+    ) -> None:  # fmt: skip
         last, self._last = self._last, (at_ns, pose)
         # Wrong counts look like a fast robot until they are compared with the speeds.
         if last is not None and not lies and not self._miscounted:
@@ -291,30 +297,34 @@ class PoseWitness:
             if at_ns - self._asked_ns < NS // 5:  # behind a silence nobody knows the way since
                 self._put(now_ns, self._expected, true, pose, by_time)
             self._expected = None
+        xx, _, _, yy, _, yawyaw = covariance
+        sigma, sigma_yaw = math.sqrt(xx + yy), math.sqrt(yawyaw)
         if self._anchor is None:
-            self._anchor = true, pose
+            self._anchor, self._anchor_m, self._anchor_rad = (true, pose), sigma, sigma_yaw
             self._room, self._spoiled_before = by_time, self._spoiled
+            return
+        if not counted:
             return
         expected = _through(self._anchor, true)
         dx, dy = pose[0] - expected[0], pose[1] - expected[1]
         dyaw = math.remainder(pose[2] - expected[2], math.tau)
-        xx, _, _, yy, _, yawyaw = covariance
         far = math.hypot(true[0] - self._anchor[0][0], true[1] - self._anchor[0][1])
         by_time += self._unsure_m
         room = ROOM_M + self._room + by_time
         room_yaw = ROOM_RAD + self._room / self.track + by_time / self.track
         room_yaw += self._spoiled - self._spoiled_before
-        allowed = SIGMAS * math.sqrt(xx + yy) + room + far * room_yaw
+        room_yaw += SIGMAS * self._anchor_rad
+        allowed = SIGMAS * (sigma + self._anchor_m) + room + far * room_yaw
         off = math.hypot(dx, dy)
         if off > allowed:
             raise BrokenError(
                 "the pose stays within its covariance", now_ns,
                 f"{off:.3f} m off, allowed {allowed:.3f} m",
             )  # fmt: skip
-        if abs(dyaw) > SIGMAS * math.sqrt(yawyaw) + room_yaw:
+        if abs(dyaw) > SIGMAS * sigma_yaw + room_yaw:
             raise BrokenError(
                 "the pose stays within its covariance", now_ns,
-                f"{dyaw:.3f} rad off, sigma {math.sqrt(yawyaw):.4f}",
+                f"{dyaw:.3f} rad off, allowed {SIGMAS * sigma_yaw + room_yaw:.4f}",
             )  # fmt: skip
 
     def _spoils_pose(self, now_ns: int) -> bool:
