@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 import os
-import select
 import signal
 import threading
 import time
 from collections.abc import Callable
-from contextlib import suppress
 from pathlib import Path
 
 import pytest
 
 from acsard.cli import sim
+from acsard.core.config.settings import Config
+from acsard.core.simulator.fake_mcu import FakeMcu
 from acsard.host.errors import Exit, UsageError
 from tests.system.typed import typed
 
@@ -47,17 +47,24 @@ def ended_by(number: signal.Signals, as_soon_as: Callable[[], bool]) -> None:
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_signal_ends_the_simulated_board_and_removes_its_link(
-    tmp_path: Path, number: signal.Signals
+    tmp_path: Path, number: signal.Signals, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    link = tmp_path / "board"
+    link, boards = tmp_path / "board", list[FakeMcu]()
+
+    def made(config: Config, now_ns: int) -> FakeMcu:
+        boards.append(FakeMcu(config, now_ns))
+        return boards[0]
+
+    monkeypatch.setattr(sim, "FakeMcu", made)
 
     def writes() -> bool:
-        with suppress(OSError):
-            board = os.open(link, os.O_RDWR | os.O_NOCTTY)
-            os.write(board, b"ap00.00,bp00.00,cp00.00,dp00.00\r\n")
-            select.select([board], [], [], 10.0)  # it answers
-            os.close(board)
-        return link.exists()
+        if not link.exists():
+            return False
+        board = os.open(link, os.O_RDWR | os.O_NOCTTY)
+        os.write(board, b"ap00.00,bp00.00,cp00.00,dp00.00\r\n")
+        received = in_time(lambda: boards[0].valid_lines == 1)
+        os.close(board)
+        return received
 
     ended_by(number, writes)
     ended = typed("sim", "--link", str(link), "--fault", "ftdi", "--fault", "bias=a:0.9")
