@@ -47,4 +47,6 @@ EQUIVALENT: dict[str, str] = {
     "acsard/calibration/guide.py _doubts: \"angle = math.degrees(_line_angle(found['front'], found['rear'], wheelbase))\" -> \"angle = math.degrees(_line_angle(found['rear'], found['front'], wheelbase))\"": "only the size of the angle counts",
     "acsard/calibration/series.py by_chance: 'factor = np.where(np.abs(factor) > 1, 1 / np.where(factor, factor, 1), factor)' -> 'factor = np.where(np.abs(factor) >= 1, 1 / np.where(factor, factor, 1), factor)'": "the inverse of 1 is 1",
     "acsard/calibration/series.py : 'CYCLE_ROWS, CYCLES, MIN_BLOCKS = (range(2, 8), 6, 3)' -> 'CYCLE_ROWS, CYCLES, MIN_BLOCKS = (range(1, 8), 6, 3)'": "a cycle of one row never differs from its mean",
+    "acsard/calibration/result.py _too_good: 'if errors and errors.new < least:' -> 'if errors and errors.new <= least:'": "a measured error is never equal to the bound",
+    "acsard/calibration/comparison.py Places.match: '_, _, delay = best(np.array([track]), delay + DELAYS_S)' -> '_, _, delay = best(np.array([track]), delay - DELAYS_S)'": "the grid of delays is symmetric",
 }
