@@ -201,6 +201,12 @@ def test_a_result_has_the_approved_words(
     sure = structs.replace(found, gain=-1.0, covariance=0.01 * found.covariance, gyro_std=0.0)
     less = structs.replace(vague, p=moved(found, 0.0, 0.0, 0.3))
     farther = structs.replace(found, gain=-1.0, gyro_std=0.06, p=moved(found, 0.0, 0.0, 0.29))
+    exact = [
+        structs.replace(
+            found, gyro_std=0.0, covariance=1e-8 * np.eye(3), p=moved(found, 0, 0, track)
+        )
+        for track in (0.3, 0.395, 0.405)
+    ]
     rival = structs.replace(gyro, p=moved(found, 0.0, 0.0, 0.55))
     agrees = structs.replace(gyro, p=moved(found, 0.0, 0.0, 0.31))
     cases = {
@@ -238,6 +244,12 @@ def test_a_result_has_the_approved_words(
         "two tracks": say(names=both, others={("gyro",): gyro, ("positions",): rival}),
         "two tracks, the other way": say(
             names=both, others={("gyro",): rival, ("positions",): gyro}
+        ),
+        "sure tracks that differ by 10.5 %": say(
+            names=both, others={("gyro",): exact[0], ("positions",): exact[2]}
+        ),
+        "sure tracks that differ by 9.5 %": say(
+            names=both, others={("gyro",): exact[0], ("positions",): exact[1]}
         ),
         "two tracks that agree": say(names=both, others={("gyro",): gyro, ("positions",): agrees}),
         "two tracks of which one is not shown": say(
