@@ -71,4 +71,6 @@ EQUIVALENT: dict[str, str] = {
     "acsard/foxglove/relay.py Relay.__init__: 'self._deduplicator = EventDeduplicator()' -> 'pass'": "the first viewer of the log gets a new one",
     "acsard/foxglove/relay.py Relay.__init__: \"self._log_topic = ''\" -> 'pass'": "`offer` sets it before a viewer can come",
     "acsard/client/driving.py repeat_zeros: 'if idle_s > GRACE_S:' -> 'if idle_s >= GRACE_S:'": "times that are measured in ns are never equal",
+    "acsard/calibration/result.py _too_good: 'if errors and errors.new < least:' -> 'if errors and errors.new <= least:'": "a measured error is never equal to the bound",
+    "acsard/calibration/comparison.py Places.match: '_, _, delay = best(np.array([track]), delay + DELAYS_S)' -> '_, _, delay = best(np.array([track]), delay - DELAYS_S)'": "the grid of delays is symmetric",
 }

@@ -298,6 +298,23 @@ def test_stamps_count_if_all_samples_have_one_of_one_clock(
     assert rate == pytest.approx([12.0, 13.0, 13.5])
 
 
+def test_a_key_has_messages_of_one_type(world: World) -> None:
+    session: Any = world
+    pose = Pose(Vector3(x=1.0, y=2.0), Quaternion())
+    still, none = Twist(Vector3(), Vector3()), [0.0] * 36
+    odometry = Odometry(
+        Header(), "", PoseWithCovariance(pose, none), TwistWithCovariance(still, none)
+    )
+    messages: list[Message] = [odometry, PoseStamped(Header(), pose)]
+    for first, second in (messages, messages[::-1]):
+        sensor = Sensor(session, "b", (Odometry, PoseStamped), place_and_yaw, ("x", "y", "yaw"))
+        world.queues["b"] += [sample_of(first, "b"), sample_of(first, "b")]
+        assert sensor.receive(1.0) == 2
+        world.queues["b"].append(sample_of(second, "b"))
+        with pytest.raises(LogError, match="does the sender publish another message type"):
+            sensor.receive(1.0)
+
+
 def test_a_pose_is_a_place_and_the_turn_about_z() -> None:
     pose = Pose(Vector3(x=1.0, y=2.0), Quaternion(z=math.sin(0.4), w=math.cos(0.4)))
     assert place_and_yaw(PoseStamped(Header(), pose)) == pytest.approx((1.0, 2.0, 0.8))

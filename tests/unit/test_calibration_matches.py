@@ -445,7 +445,9 @@ def test_parts_that_contradict_the_wheels_are_left_out_with_a_margin_of_5_s(
     assert [part.name for part in parts] == ["b", "b.2", "b.3"][: len(parts)]
 
 
-def test_less_than_30_s_are_no_log(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_less_than_30_s_are_no_log_if_parts_are_left_out(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(hypotheses, "matched", lambda sensor, runs, base: GIVEN["gyro"])
+    assert not examined([log("gyro").part(0.0, 20.0)], DRIVES)[2]  # a short sound log is one
     run = log("gyro", drive=CARRIED)
     for end, some in ((26.5, True), (28.0, False)):
         match = structs.replace(GIVEN["gyro"], bad=((0, 0.0, end),))

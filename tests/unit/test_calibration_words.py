@@ -200,6 +200,13 @@ def test_a_result_has_the_approved_words(
     vague = structs.replace(found, gain=-1.0, covariance=100 * found.covariance)
     sure = structs.replace(found, gain=-1.0, covariance=0.01 * found.covariance, gyro_std=0.0)
     less = structs.replace(vague, p=moved(found, 0.0, 0.0, 0.3))
+    farther = structs.replace(found, gain=-1.0, gyro_std=0.06, p=moved(found, 0.0, 0.0, 0.29))
+    exact = [
+        structs.replace(
+            found, gyro_std=0.0, covariance=1e-8 * np.eye(3), p=moved(found, 0, 0, track)
+        )
+        for track in (0.3, 0.395, 0.405)
+    ]
     rival = structs.replace(gyro, p=moved(found, 0.0, 0.0, 0.55))
     agrees = structs.replace(gyro, p=moved(found, 0.0, 0.0, 0.31))
     cases = {
@@ -238,6 +245,12 @@ def test_a_result_has_the_approved_words(
         "two tracks, the other way": say(
             names=both, others={("gyro",): rival, ("positions",): gyro}
         ),
+        "sure tracks that differ by 10.5 %": say(
+            names=both, others={("gyro",): exact[0], ("positions",): exact[2]}
+        ),
+        "sure tracks that differ by 9.5 %": say(
+            names=both, others={("gyro",): exact[0], ("positions",): exact[1]}
+        ),
         "two tracks that agree": say(names=both, others={("gyro",): gyro, ("positions",): agrees}),
         "two tracks of which one is not shown": say(
             names=both,
@@ -251,6 +264,14 @@ def test_a_result_has_the_approved_words(
         ),
         "one that is not so far": say(
             names=both, others={("gyro",): gyro, ("positions",): less}, p=far, **worse
+        ),
+        "one that is farther than its deviation": say(
+            names=both, others={("gyro",): gyro, ("positions",): farther}, p=far, **worse
+        ),
+        "one that is farther, but shows no track": say(
+            names=both,
+            others={("gyro",): gyro, ("positions",): structs.replace(farther, tracked=False)},
+            p=far, **worse,
         ),
         "none by which values are better": say(
             names=both, others={("gyro",): vague, ("positions",): vague}, p=far, **worse
