@@ -155,7 +155,9 @@ def test_a_robot_whose_file_the_check_changed_stays_switched_off(
     monkeypatch.setattr(procedure, "run", run)
     called(tmp_path, "--yes", "--wheels-are-lifted", *words, text="[mcu]\nport = '/dev/none'\n")
     robot.call.assert_called_with("activate", numbers=released)
-    assert ("restart the daemon" in capsys.readouterr().err) is (7 not in released)
+    said = capsys.readouterr().err
+    assert ("restart the daemon" in said) is (7 not in released)
+    assert ("each sender must send a zero first" in said) is (7 in released)
     if 7 in released:
         refusal = schema.ServiceReply(success=False, message="a stop holds it")
         robot.call.side_effect = [robot.call.return_value, refusal]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from contextlib import nullcontext
 from pathlib import Path
 from typing import cast
@@ -78,6 +79,9 @@ def test_get_prints_the_answer_of_each_robot_and_fails_if_one_is_silent(
     out, err = capsys.readouterr()
     assert out.splitlines() == lines
     assert ("b: NO ANSWER: nobody" in err) == (code != Exit.OK)
+    monkeypatch.setattr(sys.stdout, "isatty", lambda: True)
+    main(["get", "state"])
+    assert "\n" in capsys.readouterr().out.strip(), "a person gets a line for each field"
 
 
 def test_a_cause_that_several_robots_have_is_printed_once(

@@ -343,9 +343,22 @@ def test_an_empty_command_line_is_the_daemon_s(monkeypatch: pytest.MonkeyPatch) 
         ran.append(args.verb)
         return 0
 
-    module = SimpleNamespace(__doc__="", add_options=lambda _: None, main=run)
+    module = SimpleNamespace(
+        __doc__="", add_options=lambda known: known.add_argument("--id"), main=run
+    )
     monkeypatch.setattr("acsard.cli.command_line._module", lambda _: module)
     assert main([]) == 0
     monkeypatch.setattr(sys, "argv", ["acsard", "top"])
     assert main() == 0
-    assert ran == ["run", "top"]
+    assert main(["--id", "robot1"]) == 0
+    assert ran == ["run", "top", "run"]
+
+
+@pytest.mark.parametrize(
+    ("word", "begins"), [("--version", "acsard "), ("--help", "usage: acsard")]
+)
+def test_an_option_of_acsard_itself_is_not_the_daemon_s(word: str, begins: str) -> None:
+    ended = typed(word)
+    assert ended.code == 0
+    assert ended.out.startswith(begins)
+    assert "usage: acsard run" not in ended.out

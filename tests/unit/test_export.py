@@ -130,8 +130,9 @@ def test_an_existing_file_is_replaced_only_with_force(
 ) -> None:
     new, short = tmp_path / "new", part_of(path, 0.0, 0.5)
     first = export(short, new, kind)
-    with pytest.raises(FileExistsError, match="--force"):
+    with pytest.raises(FileExistsError, match="--force") as raised:
         export(short, new, kind)
+    assert raised.value.strerror == "this path exists already; --force overwrites it"
     assert export(part_of(path, 0.0, 0.2), new, kind, force=True) < first
     assert [*tmp_path.iterdir()] == [new]
 

@@ -208,6 +208,19 @@ def test_every_event_has_a_row_with_the_client_that_caused_it() -> None:
     assert (axis["categoryarray"], axis["range"]) == ([*LEVELS], [len(LEVELS) - 0.5, -0.5])
 
 
+def test_the_path_has_the_places_of_warnings_and_errors_and_of_nothing_else() -> None:
+    at_ns = drive_of_two()[-1].wall_ns
+    more = [event("a", "link", at_ns, "warning"), event("b", "fault", at_ns, "error")]
+    text = report([*drive_of_two(), event("c", at_ns=at_ns), *more], "acsar", [])
+    (path,) = traces(text, "path")
+    for level in ("warning", "error"):
+        marks = [m for m in pictures(text)["path"]["data"] if m["name"] == level]
+        told = [item.message for item in drive_of_two() if isinstance(item.message, Log)]
+        count = sum(log.level == LEVELS[level] for log in told) + 1
+        assert [len(mark["x"]) for mark in marks] == [count]
+        assert marks[0]["x"][-1] == pytest.approx(path["x"][-1], abs=1e-4)
+
+
 def test_the_name_of_an_event_is_in_words() -> None:
     text = report([event("it rolls", "wheel_fault")], "acsar", [])
     (mark,) = [mark for mark in traces(text, "info") if mark["x"]]

@@ -203,6 +203,11 @@ def test_the_list_names_the_recordings_that_cannot_be_read(where: Path, tmp_path
     with pytest.MonkeyPatch.context() as patched:
         patched.setattr("acsard.cli.recording.first_head", opened)
         code, out, _ = log(tmp_path)
+        now = time.time()
+        for at_s, is_recorded in ((now, True), (now - 3600.0, False)):
+            os.utime(tmp_path / name(1), (at_s, at_s))
+            first, *_ = log(tmp_path)[1].splitlines()
+            assert ("[being recorded]" in first) == is_recorded
     rows = out.splitlines()
     assert code == 0
     assert [row.split()[0] for row in rows] == [name(1), name(2), name(3)]
