@@ -366,7 +366,7 @@ def test_the_method_follows_from_the_options_and_the_gyro(
     assert config == parse(text.encode())
 
 
-def test_whatever_ends_a_guided_drive_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_cause_that_ends_a_guided_drive_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     def raises(error: BaseException) -> Callable[[], None]:
         def disturb() -> None:
             raise error

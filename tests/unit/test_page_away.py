@@ -103,7 +103,7 @@ async def test_a_token_that_is_newer_than_the_last_reading_is_waited_for(
         assert (await away.ask("GET api/whoami", text))[0] == 200
 
 
-async def test_a_link_becomes_a_cookie_that_replaces_no_greater_one_unasked(
+async def test_a_link_of_a_lower_role_replaces_a_cookie_only_if_asked_to(
     tmp_path: Path, certificate: Certificate
 ) -> None:
     async with opened(tmp_path, certificate) as away:

@@ -281,7 +281,7 @@ async def test_a_path_called_with_another_method_names_the_method_it_accepts(who
         (b"\x16\x03\x01\x02\r\n\r\n", "malformed", b"bytes that are not an HTTP request"),
     ],
 )
-async def test_bytes_that_are_no_request_are_answered_counted_and_end_the_connection(
+async def test_bytes_that_are_not_a_request_are_answered_counted_and_end_the_connection(
     whole: Whole, sent: bytes, reason: str, words: bytes
 ) -> None:
     async with whole.served() as (url, _), asyncio.timeout(PATIENCE_S):
