@@ -467,12 +467,6 @@ def test_a_guided_drive_has_the_speed_and_length_that_robot_and_floor_allow(
     assert getattr(Setup.of(parse(text.encode())), field) == pytest.approx(value)
 
 
-def test_a_person_stands_beside_a_robot_that_is_not_known_to_skid() -> None:
-    assert not Options().without_person
-    for method in METHODS:
-        assert legs(method, SETUP) == legs(method, SETUP, 1.0)
-
-
 def test_the_least_limits_of_a_guided_drive() -> None:
     for text, some in (
         ("linear_speed = 0.051", True), ("linear_speed = 0.049", False),
