@@ -100,8 +100,9 @@ def calibrate(log: Log, config: Config, source: str) -> Result:
                 words = [f"{NAMES[s]} is left out: no value is surely better by it" for s in vague]
                 log, matches, found = Log(some, (*words, *log.notes)), kept, other
         if not found.tracked:
+            fitted = " and ".join(NAMES.get(sensor, sensor) for sensor in found.sensors)
             raise LogError(
-                f"{' and '.join(found.sensors)} show no track, because others fit them as well: "
+                f"the log does not show the track, because other tracks fit {fitted} as well: "
                 + (forward(runs) or "drive on after each turn on the spot, and drive curves")
             )
         few = [f"{NAMES[sensor]} is left out, because it has too few values: 1 Hz or more is needed"

@@ -27,7 +27,7 @@ class _Approach(NamedTuple):
         return math.copysign(max(self.slowest, speed), left)
 
     def ends(self, left: float, before: float) -> bool:
-        # `before` was left before the last motion.
+        # `left` is the rest of the way, and `before` the rest before the last motion.
         return abs(left) <= self.tolerance or (left * before < 0.0 and abs(left) <= abs(before))
 
 

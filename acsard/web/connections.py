@@ -210,7 +210,7 @@ class HttpConnection(web.RequestHandler):
         )
         self.peer, self.places = peer, places
         self.token = ""  # digest of the token for which this connection counts
-        self.opening: asyncio.Task[None] | None = None  # a reference: asyncio keeps none
+        self.opening: asyncio.Task[None] | None = None  # asyncio keeps only a weak reference
         # Ends the connection for a reason, which a WebSocket sends to its client.
         self.end: Callable[[str], None] = lambda why: self.cut()
         self._connections = connections

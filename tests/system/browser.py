@@ -45,7 +45,8 @@ class Page(Program):
         plain, secure = (free_endpoint().rpartition(":")[2] for _ in range(2))
         self.here, self.away = f"http://127.0.0.1:{plain}", f"https://{at or NAME}:{secure}"
         self.state, self.tls = where / "state", where / "tls"
-        self.env = environment(XDG_STATE_HOME=str(self.state), **more)
+        # For root, another variable would lead to the tokens of a service of this machine.
+        self.env = environment(STATE_DIRECTORY=str(self.state / "acsard-web"), **more)
         self._config = daemon.config
         self.told = ["--config", str(daemon.config), "--address", self.here]
         if self.tls.is_dir():

@@ -60,7 +60,7 @@ class Watched:
     def _start(self, name: str, endpoint: str) -> None:
         daemon = self.stack.enter_context(robot_at(endpoint, self.where, name, ready=False))
         daemon.says("bus ")
-        env = environment(XDG_STATE_HOME=str(self.where / f"{name}.tokens"))
+        env = environment(STATE_DIRECTORY=str(self.where / f"{name}.tokens"))
         told = [
             "--config",
             str(daemon.config),

@@ -77,7 +77,7 @@ def test_each_role_may_use_the_same_keys_as_at_a_robot_s_gateway(role: Role, mes
 
 
 @each("message", ["reply", "declare_queryable", "liveliness_token"])
-def test_behind_a_router_no_person_answers_for_a_robot_and_a_robot_for_itself_only(
+def test_behind_a_router_only_a_robot_answers_for_itself(
     message: str,
 ) -> None:
     """Otherwise a viewer could show the others a pose, a state or a version of its own."""

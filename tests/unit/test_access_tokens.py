@@ -225,13 +225,17 @@ def test_the_link_of_an_invitation_and_the_list_say_how_long_it_lasts(
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("STATE_DIRECTORY", str(tmp_path / "state"))
     Authority.make(Path("tls"), "test", 1).issue(Path("tls"), "robot", ["localhost"], 1)
-    for words, lasts in ((("viewer", "--hours", "1"), "1 h"), (("operator",), "30 d")):
+    for words, lasts in (
+        (("viewer", "--hours", "1"), "1 h"),
+        (("operator",), "30 d"),
+        (("maintainer", "--days", "3"), "3 d"),
+    ):
         web = ["web", "--tls", "tls", "--address", "https://127.0.0.1:8443", "invite"]
         assert main([*web, *words]) == 0
         assert f", for {lasts}; the link" in capsys.readouterr().out
     assert main(["web", "tokens"]) == 0
     rows = capsys.readouterr().out.splitlines()
-    assert [row.rpartition(", ")[2] for row in rows] == ["1 h left", "30 d left"]
+    assert [row.rpartition(", ")[2] for row in rows] == ["1 h left", "30 d left", "3 d left"]
 
 
 @pytest.mark.skipif(os.geteuid() != 0, reason="needs root, to become a user without permission")

@@ -366,7 +366,7 @@ def test_the_method_follows_from_the_options_and_the_gyro(
     assert config == parse(text.encode())
 
 
-def test_whatever_ends_a_guided_drive_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_cause_that_ends_a_guided_drive_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     def raises(error: BaseException) -> Callable[[], None]:
         def disturb() -> None:
             raise error
@@ -465,12 +465,6 @@ def test_a_guided_drive_has_the_speed_and_length_that_robot_and_floor_allow(
     text: str, field: str, value: float
 ) -> None:
     assert getattr(Setup.of(parse(text.encode())), field) == pytest.approx(value)
-
-
-def test_a_person_stands_beside_a_robot_that_is_not_known_to_skid() -> None:
-    assert not Options().without_person
-    for method in METHODS:
-        assert legs(method, SETUP) == legs(method, SETUP, 1.0)
 
 
 def test_the_least_limits_of_a_guided_drive() -> None:

@@ -378,7 +378,7 @@ CAUSES: dict[str, tuple[Callable[[], bytes], str]] = {
     "receivers 0.5 m apart": (lambda: alternating(PLACES, "x", 0.5, 2), f"x, y, {MIXED}"),
     "turns on the spot": (
         lambda: changed(PLACES, 3, lambda r: between(r, 0.69, 1.1, np.nan, *PLACES)),
-        "positions show no track"),
+        "other tracks fit x, y as well"),
     "counts of 16 bits": (lambda: overflowing(GYRO), ADD_UP),
     "counts of 16 bits, by headings": (lambda: overflowing((*PLACES, *HEADING)), ADD_UP),
     "counts of one side": (

@@ -260,7 +260,7 @@ def test_a_distance_is_as_sure_as_a_tape() -> None:
             with_distance(read(text(series(t, 0 * t + left, 0 * t + right, 0 * t))), "", 0.6)
 
 
-def test_a_distance_is_not_that_of_a_run_that_rocks() -> None:
+def test_a_distance_is_refused_for_a_run_that_rocks() -> None:
     t = np.arange(0.0, 6.0, 0.05)
     for rocks, straight in ((0.0, True), (6.0, False)):
         for sides in ((2 + rocks * np.sin(t * math.tau), 0 * t + 2),

@@ -445,7 +445,7 @@ def test_parts_that_contradict_the_wheels_are_left_out_with_a_margin_of_5_s(
     assert [part.name for part in parts] == ["b", "b.2", "b.3"][: len(parts)]
 
 
-def test_less_than_30_s_are_no_log_if_parts_are_left_out(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_log_of_which_parts_are_left_out_needs_30_s(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(hypotheses, "matched", lambda sensor, runs, base: GIVEN["gyro"])
     assert not examined([log("gyro").part(0.0, 20.0)], DRIVES)[2]  # a short sound log is one
     run = log("gyro", drive=CARRIED)
@@ -462,7 +462,7 @@ def test_less_than_30_s_are_no_log_if_parts_are_left_out(monkeypatch: pytest.Mon
 # one sensor beside the wheels
 
 
-def test_a_row_that_is_no_possible_robot_must_be_twice_as_clear() -> None:
+def test_a_row_of_an_impossible_robot_must_be_twice_as_clear() -> None:
     for track, possible in (
         (0.79, False),
         (0.81, True),

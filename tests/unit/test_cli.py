@@ -137,7 +137,7 @@ def test_each_silence_is_explained_once(
         assert capsys.readouterr().err == "acsard: the way to it is cut\n"
 
 
-def test_a_silence_without_a_known_reason_is_looked_into_once_in_each_two_seconds(
+def test_the_reason_of_a_silence_is_looked_for_every_two_seconds(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     looks = list[str]()

@@ -189,24 +189,8 @@ def test_move_drives_each_way_in_turn_and_prints_where_the_robot_is(
         get=robot.get,
     )
     monkeypatch.setattr(move, "Client", lambda _: client)
-    assert (
-        main(
-            [
-                "move",
-                "forward",
-                "1",
-                "left",
-                "90",
-                "back",
-                "0.5",
-                "--linear",
-                "0.2",
-                "--angular",
-                "0.7",
-            ]
-        )
-        == 0
-    )
+    words = "move forward 1 left 90 back 0.5 --linear 0.2 --angular 0.7"
+    assert main(words.split()) == 0
     assert driven == [("move", 1.0, 0.2), ("turn", 90.0, 0.7), ("move", -0.5, 0.2)]
     assert capsys.readouterr() == ("x   +0.530 m  y   -1.000 m  yaw   +0.0°\n", "")
 

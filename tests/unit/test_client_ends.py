@@ -138,10 +138,10 @@ def test_the_end_of_a_program_ends_the_connections_whose_threads_cannot(
     assert ends == ["main", "over", "daemon"]
 
 
-def test_no_zero_is_sent_to_a_robot_that_follows_its_last_speed_no_more(
+def test_no_zero_is_sent_to_a_robot_that_no_longer_follows_its_last_speed(
     session: Session, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """It would only stop the next sender."""
+    """A late zero would stop the next sender."""
     robot = client_of(session)
     without_states(robot, monkeypatch)
     for speed in (0.0, 0.3):

@@ -198,7 +198,7 @@ def test_a_topic_that_a_viewer_opens_is_followed_queried_and_forwarded(
     assert woken == [world.bridge._wake.set] * 2
 
 
-def test_a_session_that_closes_ends_no_round(world: World) -> None:
+def test_a_session_that_closes_does_not_end_a_round(world: World) -> None:
     relay = world.bridge._relay
     stream: Any = SimpleNamespace(try_recv=Mock(side_effect=zenoh.ZError("closed")))
     relay._followed["odom"] = stream
@@ -221,7 +221,7 @@ def test_the_end_of_the_bridge_waits_for_the_server_but_not_for_ever(
     released.set()
 
 
-def test_a_topic_that_no_viewer_shows_any_more_costs_no_messages(world: World) -> None:
+def test_a_topic_that_no_viewer_shows_is_no_longer_followed(world: World) -> None:
     relay, ended = world.bridge._relay, list[str]()
     for key in ("odom", "state"):
         stream: Any = SimpleNamespace(undeclare=partial(ended.append, key))

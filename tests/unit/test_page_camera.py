@@ -93,7 +93,7 @@ async def test_an_answer_that_is_not_a_stream_is_an_error() -> None:
         await anext(pictures("text/html", reader))
 
 
-async def test_a_camera_that_nobody_asks_for_is_read_no_more(
+async def test_a_camera_is_not_read_while_nobody_asks_for_it(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     now_ns, read = 0, 0

@@ -95,10 +95,10 @@ async def test_a_connection_beyond_the_limit_is_closed_and_the_next_has_the_plac
             each.close()
 
 
-async def test_a_client_that_leaves_before_it_is_accepted_ends_no_server(
+async def test_a_client_that_leaves_before_it_is_accepted_does_not_end_the_server(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Or the process may open no more files for a moment."""
+    """An `accept` also fails while the process has too many open files."""
     loop = asyncio.get_running_loop()
     accept, failures = loop.sock_accept, iter([OSError(24, "Too many open files")])
 
@@ -218,9 +218,12 @@ async def test_a_client_that_sends_no_further_request_in_time_is_disconnected(
 ) -> None:
     """One client sends nothing, one half of a request, and one nothing behind its request."""
     monkeypatch.setattr(connections, "IDLE_S", 0.02)
-    async with asyncio.timeout(20.0), accepting(Counts()) as (host, port):
-        reader, writer = await asyncio.open_connection(host, port)
-        writer.write(sent)
+    async with asyncio.timeout(20.0), accepting(Counts()) as address:
+        # The request waits already when the server accepts the connection, however busy this is.
+        client = socket.create_connection(address)
+        client.sendall(sent)
+        client.setblocking(False)
+        reader, writer = await asyncio.open_connection(sock=client)
         assert (await reader.read())[:12] == answer
         writer.close()
 

@@ -112,7 +112,7 @@ def test_each_line_names_the_client_with_the_most_refusals_since_the_last_line()
     assert counts.new_refusals() is None
 
 
-def test_a_client_of_many_addresses_fills_no_memory_and_hides_no_client_before_it() -> None:
+def test_refusals_of_many_addresses_take_bounded_memory_and_keep_the_first_ones() -> None:
     counts = Counts()
     for number in range(MAX_COUNTED_CLIENTS):
         counts.refuse("role", f"first {number}")

@@ -94,7 +94,7 @@ async def test_a_beat_that_arrives_while_other_values_are_sent_is_sent_once() ->
     assert [said["key"] for said in socket.sent] == ["events", "beat"]
 
 
-async def test_messages_that_a_client_does_not_read_fill_no_memory() -> None:
+async def test_messages_that_a_client_does_not_read_take_bounded_memory() -> None:
     """It may ask for much, such as a pong for each ping, and read nothing."""
     out = Outgoing(cast(Any, None), REQUEST, STREAMS, Counts(), "")
     for number in range(1000):

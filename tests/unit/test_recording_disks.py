@@ -193,7 +193,7 @@ def test_steps_that_a_full_disk_refused_are_counted_exactly(room: int, box: Box)
     box.end()
 
 
-def test_a_source_that_waits_while_the_disk_refuses_ends_no_recording(box: Box) -> None:
+def test_a_source_that_waits_while_the_disk_refuses_does_not_end_the_recording(box: Box) -> None:
     with failing("open"):
         box.recorder._queue.append(Waits.of(STEP.now, {"teleop": Reason("higher", "app drives")}))
         box.record(1)

@@ -270,7 +270,7 @@ def test_the_curves_are_the_messages(wheels: WheelMap, names: tuple[str, ...]) -
     assert len(received) >= 3
 
 
-def test_the_counters_of_a_daemon_that_started_anew_are_no_negative_rates() -> None:
+def test_rates_are_not_negative_after_a_restart_of_the_daemon() -> None:
     first, *_ = states()
     messages = []
     for second, (sent, missed) in enumerate([(100, 5), (200, 5), (50, 6), (150, 6)]):
