@@ -15,6 +15,7 @@ class Bench:
 
     def __init__(self, count: float = FINE) -> None:
         self.trail, self.count, self.doubt, self.off = Trail(), count, 0.0, 0.0
+        self.ended = 0.0  # of `doubt`, without the open step
         self.speed = 0.0
         self.angle = 0.0
         self.shown = 0.0  # without the part of a count
@@ -36,8 +37,9 @@ class Bench:
             self.shown += gain * turned
             shown = self.count * round(self.shown / self.count) - counted
             self.trail.follow(command, shown, STEP_S, LAG_S)
-            if self.trail.ends:
-                self.doubt += self.trail.take(LAG_S, self.count)
+            if self.trail.ends(self.count):
+                self.ended += self.trail.take(LAG_S, self.count)
+            self.doubt = self.ended + self.trail.due - self.trail.shown
 
 
 @each("motor", [0.02, 0.1, 0.3, 0.5])
@@ -106,6 +108,8 @@ def test_a_side_that_nearly_obeys_is_not_said(gain: float) -> None:
 def test_a_pose_that_is_set_has_no_doubt() -> None:
     bench = Bench()
     bench.run(10.0, 3.0, gain=0.0)
+    bench.trail.follow(10.0, 0.0, STEP_S, LAG_S)
     bench.trail.forget()
+    assert bench.trail.due == 0.0
     assert not bench.trail.differs
     assert bench.trail.astray == 0.0

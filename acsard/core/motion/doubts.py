@@ -6,6 +6,9 @@ in the covariance, the deviation of the distance is the difference's share of th
 the motor, and a slope that the robot drives up and down, give it back. A large difference is said,
 too. Two wheels of a side that contradict each other are in doubt by half of their difference.
 
+A step is compared when it is long enough for the counts. Until then all of its difference is in
+doubt, too: counts that have not come yet take it back.
+
 In a silence the board may have obeyed any command of that time (`CommandRange`). So the middle of
 what it may have done is compared, and half of the range is a doubt beside it. Both are kept apart:
 the lines around a silence tell nothing of it, and take nothing of its doubt back.
@@ -23,10 +26,9 @@ from acsard.core.motion.sides import SideName, lagged
 from acsard.core.motion.wheels import Wheels
 from acsard.core.values import Rad, RadPerS, Seconds, Wheels4
 
-# A step is long enough for a comparison after this angle, or this time. With coarse encoders its
-# difference may be theirs: then the next step takes it back.
-STEP_ANGLE, STEP_S = 0.1, 1.0
-NOISE_ANGLE = 0.025
+# A step is long enough for a comparison after these counts, or this time.
+STEP_COUNTS, STEP_S = 6.0, 1.0
+NOISE_COUNTS = 1.5  # of an angle
 
 # A difference is said beyond this share of the recent way, this time at the fastest speed, beside
 # the response time, and these counts.
@@ -56,23 +58,21 @@ class Trail(Struct):
         self.shown += angle
         self.seconds += s
 
-    @property
-    def disagrees(self) -> bool:
+    def disagrees(self, count: Rad) -> bool:
         size = max(abs(self.due), abs(self.shown))
-        return abs(self.due - self.shown) > AGREEMENT * size + NOISE_ANGLE
+        return abs(self.due - self.shown) > AGREEMENT * size + NOISE_COUNTS * count
 
-    @property
-    def ends(self) -> bool:
-        """Whether the open step is long enough for a comparison."""
+    def ends(self, count: Rad) -> bool:
+        """Return whether the open step is long enough for a comparison."""
         size = max(abs(self.due), abs(self.shown))
-        return self.disagrees or size >= STEP_ANGLE or self.seconds >= STEP_S
+        return self.disagrees(count) or size >= STEP_COUNTS * count or self.seconds >= STEP_S
 
     def take(self, lag: Seconds, count: Rad, *, said: bool = True) -> Rad:
         """End the step, and return what is in doubt now, as one standard deviation.
 
         Of a silence, nothing is `said`: the wheels may have obeyed another command in it.
         """
-        more, disagrees, size = self.due - self.shown, self.disagrees, abs(self.due)
+        more, disagrees, size = self.due - self.shown, self.disagrees(count), abs(self.due)
         if not said:
             self.due = self.shown = self.seconds = 0.0
             return more
@@ -92,6 +92,7 @@ class Trail(Struct):
 
     def forget(self) -> None:
         self.astray = self.short = self.recent = 0.0
+        self.due = self.shown = self.seconds = 0.0
         self.weak = self.differs = False
 
 
@@ -101,6 +102,7 @@ class Found(NamedTuple):
     astray: Wheels4  # of the sides
     margin: Wheels4  # of the sides, in a silence
     silent: bool  # a silence may be the cause
+    open: Wheels4  # of the sides, in the open step: it replaces that of the last update
     wheels: list[tuple[SideName, Wheels4]]  # of a side whose wheels contradict each other
 
 
@@ -162,7 +164,7 @@ class Doubts(Struct):
                 half = (rolled[side.front] - rolled[side.rear]) / 2
                 wheels_astray.append((side.name, of_side(side.front, half)))
         # One side alone would be in doubt of a turn.
-        if self.left.ends or self.right.ends:
+        if self.left.ends(count) or self.right.ends(count):
             silent, self.silent = self.silent, False
             left, right = (trail.take(lag, count, said=not silent) for trail in trails)
             astray = right, left, left, right
@@ -170,7 +172,8 @@ class Doubts(Struct):
             margin = right, left, left, right
         self.commanded, self.seconds, self.unknown = (0.0, 0.0), 0.0, False
         self.rolled = self.used = AT_REST
-        return Found(astray, margin, silent, wheels_astray)
+        left, right = (trail.due - trail.shown for trail in trails)
+        return Found(astray, margin, silent, (right, left, left, right), wheels_astray)
 
     def forget(self) -> None:
         """Forget all doubts: the pose was set."""

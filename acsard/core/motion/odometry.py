@@ -193,6 +193,8 @@ class Odometry(Struct):
             if found.margin != AT_REST:
                 distance, angle = model.kinematics.moved(found.margin)
                 uncertainty.miss("silent range", distance, turns * angle, heading)
+            distance, angle = model.kinematics.moved(found.open)
+            uncertainty.miss_yet(distance, turns * angle, heading)
             for side, angles in found.wheels:
                 distance, angle = model.kinematics.moved(angles)
                 uncertainty.miss(side, distance, turns * angle, heading)

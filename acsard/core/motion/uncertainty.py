@@ -227,6 +227,8 @@ class Uncertainty(Struct):
     period: Seconds = ASSUMED_PERIOD_S
     in_play: Rad = 0.0  # heading from the middle of the play, within `ErrorModel.play`
     astray: Metres = 0.0  # standard deviation to all sides
+    # What the causes "way" and "turn" have beside `columns` until the next update.
+    yet: tuple[Vector, Vector] = ORIGIN, ORIGIN
 
     @classmethod
     def initial(cls, model: ErrorModel, pose: Pose) -> Uncertainty:
@@ -304,6 +306,14 @@ class Uncertainty(Struct):
         if self.bend.rolled > BEND_M:
             self._bend()
         self._publish()
+
+    def miss_yet(self, distance: Metres, turn: Rad, heading: Rad) -> None:
+        """Replace the motion that the pose may have missed in a step that has not ended."""
+        c, s = math.cos(heading), math.sin(heading)
+        yet = (c * distance, s * distance, 0.0), (0.0, 0.0, turn)
+        if yet != self.yet:
+            self.yet = yet
+            self._publish()
 
     def set_twist(
         self, model: ErrorModel, twist: Twist, step: RadPerS, slips: bool, gyro: float | None
@@ -390,7 +400,13 @@ class Uncertainty(Struct):
         new.added = xx + mean_x * mean_x, xy + mean_x * mean_y, yy + mean_y * mean_y
 
     def _publish(self) -> None:
-        p, (xx, xy, yy) = _total(self.p, self.columns), self.bend.added
+        columns = self.columns
+        if self.yet != (ORIGIN, ORIGIN):
+            columns = [*columns]
+            for i, (x, y, yaw) in zip((MISSED["way"], MISSED["turn"]), self.yet, strict=True):
+                of_x, of_y, of_yaw = columns[i]
+                columns[i] = of_x + x, of_y + y, of_yaw + yaw
+        p, (xx, xy, yy) = _total(self.p, columns), self.bend.added
         far = self.astray * self.astray
         p = PoseCovariance(p.xx + xx + far, p.xy + xy, p.xyaw, p.yy + yy + far, p.yyaw, p.yawyaw)
         known = p.xx < MAX_VARIANCE and p.yy < MAX_VARIANCE and p.yawyaw < MAX_VARIANCE
