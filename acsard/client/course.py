@@ -1,8 +1,8 @@
 """Courses that end at a distance or an angle, measured by `odom`. This module is pure.
 
-The speed falls with the rest of the way, to a speed so low that the robot stops within the
-tolerance: 5 mm and 0.5 degrees in the simulator. A robot that overshoots comes back, unless `odom`
-jumped across the end: coarse encoders show no pose that is nearer.
+The speed falls with the rest of the way, to a speed so low that most robots stop within the
+tolerance. One that rests elsewhere comes back. `odom` may jump across the end, because coarse
+encoders show no pose that is nearer.
 """
 
 from __future__ import annotations
@@ -12,6 +12,8 @@ from typing import NamedTuple, Protocol
 
 from acsard.core.messages.schema import Odometry
 from acsard.core.values import Twist
+
+NEAR = 3.0  # times the tolerance, at rest: 6 mm or 0.7 degrees
 
 
 class _Approach(NamedTuple):
@@ -27,8 +29,11 @@ class _Approach(NamedTuple):
         return math.copysign(max(self.slowest, speed), left)
 
     def ends(self, left: float, before: float) -> bool:
-        # `left` is the rest of the way, and `before` the rest before the last motion.
+        # `before` was left before the last motion.
         return abs(left) <= self.tolerance or (left * before < 0.0 and abs(left) <= abs(before))
+
+    def is_near(self, left: float, before: float) -> bool:
+        return abs(left) <= NEAR * self.tolerance or self.ends(left, before)
 
 
 _LINEAR = _Approach(0.3, 2.0, 0.02, 0.002)
@@ -43,6 +48,9 @@ class Course(Protocol):
 
     @property
     def is_done(self) -> bool: ...
+
+    def settle(self, odom: Odometry | None) -> bool:
+        """Process the message of a robot that rests, and return whether it is near the end."""
 
     @property
     def twist(self) -> Twist: ...
@@ -71,6 +79,13 @@ class Straight:
     def is_done(self) -> bool:
         return _LINEAR.ends(self.left, self._before)
 
+    def settle(self, odom: Odometry | None) -> bool:
+        before = self._before
+        if odom is not None:
+            self.odom(odom)
+        self._before = self.left
+        return _LINEAR.is_near(self.left, before)
+
     @property
     def twist(self) -> Twist:
         # Keep the heading, at less than half of the usual turn rate.
@@ -95,6 +110,13 @@ class Turn:
     @property
     def is_done(self) -> bool:
         return _ANGULAR.ends(self.left, self._before)
+
+    def settle(self, odom: Odometry | None) -> bool:
+        before = self._before
+        if odom is not None:
+            self.odom(odom)
+        self._before = self.left
+        return _ANGULAR.is_near(self.left, before)
 
     @property
     def twist(self) -> Twist:

@@ -43,6 +43,7 @@ COURSE_PERIOD_S = 0.02  # between two looks at the odometry
 MAX_ODOM_AGE_S = 0.2  # of a speed on a course
 
 COURSE_TIMEOUT_S = 3.0  # without coming nearer to the end of a course
+MAX_MISSES = 5  # of the end of a course, by a robot that rests elsewhere
 MAYBE = "is it blocked, or is a speed limit in force?"
 
 # What counts as nearer: this fraction of the rest, or on a long way this many m or rad.
@@ -221,8 +222,20 @@ def _course(begin: Callable[[Odometry], Course]) -> Steps:
                 if sets is None:
                     odom = None
                     sets = driver.poses_set if driver.watch.last_seen > began else None
-            course, nearest, nearer = begin(odom), math.inf, odometer.received
-            while not course.is_done:
+            course, nearest, nearer, misses = begin(odom), math.inf, odometer.received, 0
+            while True:
+                if course.is_done:
+                    yield from driver.stop()
+                    driver.require_pose(sets)
+                    if course.settle(odometer.newest()):
+                        return
+                    misses += 1
+                    if misses == MAX_MISSES:
+                        raise NotDrivenError(
+                            f"the robot missed the end {misses} times, and {course.left_text} is "
+                            "left: try a lower speed, or limits that the robot can keep"
+                        )
+                    nearest, nearer = math.inf, clock.steady_s()
                 now = clock.steady_s()
                 fresh = now - odometer.received < MAX_ODOM_AGE_S
                 driver.step(course.twist if fresh else None)
@@ -240,8 +253,6 @@ def _course(begin: Callable[[Odometry], Course]) -> Steps:
                 yield min(COURSE_PERIOD_S, driver.ride.period)
                 if (newest := odometer.newest()) is not None:
                     course.odom(newest)
-        yield from driver.stop()
-        driver.require_pose(sets)
 
     return steps
 

@@ -187,10 +187,11 @@ def test_a_move_of_a_robot_that_does_not_move_ends_and_names_a_wheel_fault(fault
 
 
 class Rolling(WithOdometry):
-    """A robot that follows each command at once."""
+    """A robot that follows each command, at once or behind a `lag` (s), `gain` times as fast."""
 
-    def __init__(self) -> None:
+    def __init__(self, lag: float = 0.0, gain: float = 1.0) -> None:
         super().__init__(math.inf)
+        self._lag, self._gain, self._speeds = lag, gain, (0.0, 0.0)
         self.linear = self.angular = self.way = self.turned = 0.0
 
     def send(self, linear: float, angular: float = 0.0) -> None:
@@ -207,11 +208,16 @@ class Rolling(WithOdometry):
         for pause in steps(Driver(robot)):
             self.now += pause
             assert self.now < 1100.0
-            self.way += self.linear * pause
-            self.turned += self.angular * pause
-            body.x += self.linear * math.cos(body.yaw) * pause
-            body.y += self.linear * math.sin(body.yaw) * pause
-            body.yaw += self.angular * pause
+            share = -math.expm1(-pause / self._lag) if self._lag else 1.0
+            linear, angular = self._speeds
+            linear += share * (self._gain * self.linear - linear)
+            angular += share * (self._gain * self.angular - angular)
+            self._speeds = linear, angular
+            self.way += linear * pause
+            self.turned += angular * pause
+            body.x += linear * math.cos(body.yaw) * pause
+            body.y += linear * math.sin(body.yaw) * pause
+            body.yaw += angular * pause
             if self.passed >= is_set:
                 x, y, yaw = by
                 body.x, body.y, body.yaw, is_set = body.x + x, body.y + y, body.yaw + yaw, math.inf
@@ -227,6 +233,24 @@ def test_a_long_way_at_a_low_speed_is_driven_to_its_end() -> None:
     world = Rolling()
     world.follow(turn(720.0, 0.2))
     assert world.turned == pytest.approx(4 * math.pi, abs=0.02)
+
+
+@each("lag", [0.2, 0.4])
+def test_a_robot_that_rests_beyond_the_end_comes_back(lag: float) -> None:
+    world = Rolling(lag)
+    world.follow(move(1.0, 0.5))
+    assert world.way == pytest.approx(1.0, abs=0.01)
+    world = Rolling(lag)
+    world.follow(turn(90.0, 2.0))
+    assert world.turned == pytest.approx(math.pi / 2, abs=0.02)
+
+
+def test_a_robot_that_misses_the_end_each_time_is_told_so() -> None:
+    world = Rolling(0.2, gain=15.0)
+    with pytest.raises(
+        NotDrivenError, match=r"missed the end 5 times, and -?0\.\d+ m is left: try"
+    ):
+        world.follow(move(1.0, 0.3))
 
 
 @each("by", [(3.0, -2.0, 2.0), (0.09, 0.0, 0.0), (0.0, 0.0, 0.18), (0.0, 0.0, -0.1), (0.0,) * 3])
