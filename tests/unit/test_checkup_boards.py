@@ -204,7 +204,7 @@ def lines(finding: Finding) -> Iterator[str]:
         yield f"        -> {finding.mend}"
 
 
-DAILY = ("hardware", "course")
+DAILY = ("motors", "hardware", "two_wheels", "course")
 
 
 def robots(page: str) -> Iterator[tuple[str, Robot, bool]]:
