@@ -325,6 +325,7 @@ def test_the_release_before_is_upgraded_and_back_and_goes_back_from_a_bad_versio
             ):
                 done = robot.types(*words)
                 assert done.code == 0, done
+            until(robot.recordings, 30.0, "a recording has begun")
             number, kept, recordings = robot.latch(), robot.kept(), robot.recordings()
             assert (number != "0", len(kept) > 1, len(recordings)) == (True, True, 1)
             pid, began = container.main_pid(), time.monotonic()
