@@ -36,7 +36,7 @@ DAY_NS = 86400 * NS_PER_S
 
 
 def make_certificates(where: Path, days: float = 10, authority_days: int = 10) -> Path:
-    Authority.make(where, "test", authority_days).issue(where, "robot", ["localhost"], days)
+    Authority.make(where, "test", authority_days).issue(where, "robot", ["127.0.0.1"], days)
     return where
 
 
@@ -138,13 +138,13 @@ def tls(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Certificates that are valid, expired, for later, for other names, and a stranger's."""
     place = tmp_path_factory.mktemp("tls")
     ours = Authority.make(place / "ca", "ours", 10)
-    ours.issue(place / "good", "robot", ["localhost"], 1)
-    ours.issue(place / "ended", "robot", ["localhost"], -1)
+    ours.issue(place / "good", "robot", ["127.0.0.1"], 1)
+    ours.issue(place / "ended", "robot", ["127.0.0.1"], -1)
     ours.issue(place / "elsewhere", "robot", ["robot.example"], 1)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(making, "datetime", Later)
-        ours.issue(place / "later", "robot", ["localhost"], 1)
-    Authority.make(place / "other", "other", 10).issue(place / "stranger", "x", ["localhost"], 1)
+        ours.issue(place / "later", "robot", ["127.0.0.1"], 1)
+    Authority.make(place / "other", "other", 10).issue(place / "stranger", "x", ["127.0.0.1"], 1)
     shutil.copytree(place / "stranger", place / "mixed")  # knows the robot's authority
     shutil.copy(place / "good/ca.pem", place / "mixed")
     return place
@@ -177,10 +177,10 @@ def server(own: Path) -> Iterator[str]:
                 link = context.wrap_socket(link, server_side=True)
             link.recv(100)
 
-    with socket.create_server(("localhost", 0)) as listener:
+    with socket.create_server(("127.0.0.1", 0)) as listener:
         thread = threading.Thread(target=serve)
         thread.start()
-        yield f"tls/localhost:{listener.getsockname()[1]}"
+        yield f"tls/127.0.0.1:{listener.getsockname()[1]}"
         thread.join()
 
 
