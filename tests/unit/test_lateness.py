@@ -206,6 +206,20 @@ def test_a_lower_delay_counts_when_the_commands_of_one_timeout_confirm_it() -> N
     assert sender.hear(3750, 3500) == "stale"
 
 
+@each("queue_ms", [400, 600, 800, 1000])
+@each("seconds", [5, 8, 12])
+def test_a_queue_is_refused_although_the_lower_delays_before_it_were_never_proven(
+    queue_ms: int, seconds: int
+) -> None:
+    """Behind a pause, the sender's clock runs 8 % fast, as chrony slews it, and then right."""
+    sender, begun_ms = Sender(1000), 1000 + 1000 * seconds
+    verdicts = {sender.hear(at, at + 0.08 * (at - 1000)) for at in range(2000, begun_ms, 50)}
+    assert verdicts == {"early"}
+    ahead_ms = 80 * seconds
+    late = {sender.hear(at, at - queue_ms + ahead_ms) for at in range(begun_ms, 60_000, 50)}
+    assert "" not in late
+
+
 @each("every_ms", [10, 50, 200])
 @each("ahead_ms", [0, 40, 280, 3000])
 def test_a_prompt_program_counts_beside_the_backlog_of_another_one_with_its_identity(

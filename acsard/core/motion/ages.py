@@ -94,6 +94,8 @@ class Clock(Struct):
     accepted_ns: Ns = 0  # stamp of the last accepted command
     low: int = 0  # lowest delay of a proof
     since_ns: Ns | None = None  # a proof runs, in which the delay has not fallen since then
+    # First and last arrival below the least delay since the last accepted command.
+    lower_ns: tuple[Ns, Ns] | None = None
     late: bool = False  # a command since the last accepted one was refused for its age
     first_refused: tuple[Ns, Ns] | None = None  # arrival and stamp of the first refused command
     cause: AgeVerdict = ""  # of refusals that last
@@ -105,9 +107,14 @@ class Clock(Struct):
         self.at_ns, self.least = at_ns, least
         verdict: AgeVerdict
         if least is None or delay < least - MARGIN_NS:
+            self.lower_ns = (self.lower_ns or (at_ns, at_ns))[0], at_ns
             verdict = self._prove(at_ns, delay, timeout_ns)
         else:
             self.behind = delay - min(self.lows, default=least)
+            first_ns, last_ns = self.lower_ns or (0, 0)
+            # Delays that fell too fast for a proof move nothing, but they were lower all the same.
+            if last_ns - first_ns >= timeout_ns:
+                least = min(least, self.low + (at_ns - last_ns) // RISE_DIVISOR)
             verdict = "stale" if delay - least > timeout_ns else ""
             if not verdict:  # a late command of another program is no evidence against a proof
                 self.since_ns = None
@@ -117,6 +124,7 @@ class Clock(Struct):
         if verdict:
             return self._lasting(verdict, at_ns, stamp_ns)
         self.accepted_ns, self.late, self.first_refused, self.cause = stamp_ns, False, None, ""
+        self.lower_ns = None
         self.least = delay if self.least is None else min(self.least, delay)
         if not self.lows or at_ns - self.slot_ns >= SLOT_NS:
             self.lows, self.slot_ns = [*self.lows[-(MEMORY_NS // SLOT_NS) :], self.least], at_ns
