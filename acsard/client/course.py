@@ -1,14 +1,15 @@
 """Courses that end at a distance or an angle, measured by `odom`. This module is pure.
 
 The speed falls with the rest of the way, to a speed so low that most robots stop within the
-tolerance. One that rests elsewhere comes back. `odom` may jump across the end, because coarse
-encoders show no pose that is nearer.
+tolerance. One that rests elsewhere comes back. With coarse encoders, `odom` jumps across the end:
+then the pose beside it that is nearer is the end.
 """
 
 from __future__ import annotations
 
 import math
-from typing import NamedTuple, Protocol
+from abc import ABC, abstractmethod
+from typing import ClassVar, NamedTuple
 
 from acsard.core.messages.schema import Odometry
 from acsard.core.values import Twist
@@ -28,99 +29,87 @@ class _Approach(NamedTuple):
         speed = min(fastest, math.sqrt(2.0 * self.deceleration * way), self.gain * way)
         return math.copysign(max(self.slowest, speed), left)
 
-    def ends(self, left: float, before: float) -> bool:
-        # `before` was left before the last motion.
-        return abs(left) <= self.tolerance or (left * before < 0.0 and abs(left) <= abs(before))
-
-    def is_near(self, left: float, before: float) -> bool:
-        return abs(left) <= NEAR * self.tolerance or self.ends(left, before)
-
 
 _LINEAR = _Approach(0.3, 2.0, 0.02, 0.002)
 _ANGULAR = _Approach(1.0, 2.0, 0.05, 0.004)
 
 
-class Course(Protocol):
-    left: float  # way to the end, m or rad
+class Course(ABC):
+    approach: ClassVar[_Approach]
 
+    def __init__(self, way: float, speed: float) -> None:
+        self.left = way  # to the end, m or rad
+        self.speed = speed
+        self._nearest = 0.0  # that `odom` showed when it jumped across the end
+
+    @abstractmethod
     def odom(self, odom: Odometry) -> None:
         """Process a message."""
 
     @property
-    def is_done(self) -> bool: ...
-
-    def settle(self, odom: Odometry | None) -> bool:
-        """Process the message of a robot that rests, and return whether it is near the end."""
-
-    @property
+    @abstractmethod
     def twist(self) -> Twist: ...
 
     @property
+    @abstractmethod
     def left_text(self) -> str: ...
 
+    @property
+    def is_done(self) -> bool:
+        return abs(self.left) <= max(self.approach.tolerance, self._nearest)
 
-class Straight:
+    def settle(self) -> bool:
+        """Return whether a robot that rests is near the end. If not, it has to come back."""
+        near = abs(self.left) <= max(NEAR * self.approach.tolerance, self._nearest)
+        self._nearest = 0.0
+        return near
+
+    def _shows(self, left: float) -> None:
+        if self.left * left < 0.0:
+            self._nearest = min(abs(self.left), abs(left))
+        self.left = left
+
+
+class Straight(Course):
+    approach = _LINEAR
+
     def __init__(self, odom: Odometry, distance: float, speed: float) -> None:
+        super().__init__(distance, speed)
         position = odom.pose.pose.position
         self._x, self._y, self._yaw = position.x, position.y, odom.yaw
-        self._distance, self._speed = distance, speed
-        self.left = self._before = distance
-        self.odom(odom)
+        self._distance, self._turned = distance, 0.0
 
     def odom(self, odom: Odometry) -> None:
         position = odom.pose.pose.position
         x, y = position.x - self._x, position.y - self._y
-        left = self._distance - x * math.cos(self._yaw) - y * math.sin(self._yaw)
-        if left != self.left:
-            self._before, self.left = self.left, left
+        self._shows(self._distance - x * math.cos(self._yaw) - y * math.sin(self._yaw))
         self._turned = math.remainder(odom.yaw - self._yaw, math.tau)
-
-    @property
-    def is_done(self) -> bool:
-        return _LINEAR.ends(self.left, self._before)
-
-    def settle(self, odom: Odometry | None) -> bool:
-        before = self._before
-        if odom is not None:
-            self.odom(odom)
-        self._before = self.left
-        return _LINEAR.is_near(self.left, before)
 
     @property
     def twist(self) -> Twist:
         # Keep the heading, at less than half of the usual turn rate.
         turn = max(-0.4, min(0.4, -_ANGULAR.gain * self._turned))
-        return Twist(_LINEAR.speed(self.left, self._speed), turn)
+        return Twist(self.approach.speed(self.left, self.speed), turn)
 
     @property
     def left_text(self) -> str:
         return f"{self.left:.3f} m"
 
 
-class Turn:
+class Turn(Course):
+    approach = _ANGULAR
+
     def __init__(self, odom: Odometry, angle: float, speed: float) -> None:
-        self._speed, self._yaw = speed, odom.yaw
-        self.left = self._before = angle
+        super().__init__(angle, speed)
+        self._yaw = odom.yaw
 
     def odom(self, odom: Odometry) -> None:
-        turned = math.remainder(odom.yaw - self._yaw, math.tau)
-        if turned:
-            self._before, self.left, self._yaw = self.left, self.left - turned, odom.yaw
-
-    @property
-    def is_done(self) -> bool:
-        return _ANGULAR.ends(self.left, self._before)
-
-    def settle(self, odom: Odometry | None) -> bool:
-        before = self._before
-        if odom is not None:
-            self.odom(odom)
-        self._before = self.left
-        return _ANGULAR.is_near(self.left, before)
+        self._shows(self.left - math.remainder(odom.yaw - self._yaw, math.tau))
+        self._yaw = odom.yaw
 
     @property
     def twist(self) -> Twist:
-        return Twist(0.0, _ANGULAR.speed(self.left, self._speed))
+        return Twist(0.0, self.approach.speed(self.left, self.speed))
 
     @property
     def left_text(self) -> str:

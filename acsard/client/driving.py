@@ -225,9 +225,14 @@ def _course(begin: Callable[[Odometry], Course]) -> Steps:
             course, nearest, nearer, misses = begin(odom), math.inf, odometer.received, 0
             while True:
                 if course.is_done:
-                    yield from driver.stop()
+                    for pause in driver.stop():
+                        yield pause
+                        odometer.show(course)
+                    while not odometer.show(course):  # what came before tells nothing of rest
+                        yield COURSE_PERIOD_S
+                        driver.take()
                     driver.require_pose(sets)
-                    if course.settle(odometer.newest()):
+                    if course.settle():
                         return
                     misses += 1
                     if misses == MAX_MISSES:
@@ -251,8 +256,7 @@ def _course(begin: Callable[[Odometry], Course]) -> Steps:
                         f"{course.left_text} is left: {(state and state.wheel_fault) or MAYBE}"
                     )
                 yield min(COURSE_PERIOD_S, driver.ride.period)
-                if (newest := odometer.newest()) is not None:
-                    course.odom(newest)
+                odometer.show(course)
 
     return steps
 
@@ -284,6 +288,16 @@ class _Odometer:
                 "no odometry arrives, so the way cannot be measured: is rates.odom above 10 Hz?"
             )
         return odom
+
+    def show(self, course: Course) -> bool:
+        """Show the newest message to a course, and return whether one has arrived.
+
+        The errors are those of `newest`.
+        """
+        odom = self.newest()
+        if odom is not None:
+            course.odom(odom)
+        return odom is not None
 
 
 def repeat_zeros(

@@ -421,8 +421,9 @@ FAULTS = (
     fault("counts forgotten", "the way there and back refutes wrong counts",
           "core/link/board_counts.py", "        full = full and (known or over > 1.0)\n", ""),
     fault("doubts more", "what the wheels did otherwise is in doubt three times",
-          "core/motion/doubts.py", "> most\n        return more\n",
-          "> most\n        return 3.0 * more\n"),
+          "core/motion/doubts.py", "        return Step((right, left, left, right), margin",
+          "        left, right = 3.0 * left, 3.0 * right\n"
+          "        return Step((right, left, left, right), margin"),
     fault("odometry vague", "the covariance of the pose is a hundred times as large as the errors",
         UNCERTAINTY, "        self.covariance = p if known else UNKNOWN_POSE\n",
         "        p = PoseCovariance(*(100.0 * getattr(p, name) for name in p.__struct_fields__))\n"

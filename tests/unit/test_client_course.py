@@ -130,7 +130,7 @@ class WithOdometry(World):
     def __init__(self, seconds: float, responder: Says = followed) -> None:
         super().__init__(responder)
         self.body = Robot(0.0)
-        self._odometry_s = seconds
+        self.silent_s = seconds
 
     def subscribe(self, name: str) -> Any:
         if name == "state":
@@ -138,7 +138,7 @@ class WithOdometry(World):
         queue: list[Any] = []
 
         def receive() -> Any:
-            if not queue and self.passed < self._odometry_s:
+            if not queue and self.passed < self.silent_s:
                 queue.extend([sample_of(self.body.odom(), "acsard/acsar/odom"), None])
             return queue.pop(0) if queue else None
 
@@ -243,6 +243,16 @@ def test_a_robot_that_rests_beyond_the_end_comes_back(lag: float) -> None:
     world = Rolling(lag)
     world.follow(turn(90.0, 2.0))
     assert world.turned == pytest.approx(math.pi / 2, abs=0.02)
+
+
+def test_a_course_has_not_ended_if_the_odometry_falls_silent_before_the_rest() -> None:
+    world = Rolling()
+    world.follow(move(0.5, 0.3))
+    silent_s = world.passed - 0.1
+    world = Rolling()
+    world.silent_s = silent_s
+    with pytest.raises(NoAnswerError, match="no odometry arrives"):
+        world.follow(move(0.5, 0.3))
 
 
 def test_a_robot_that_misses_the_end_each_time_is_told_so() -> None:

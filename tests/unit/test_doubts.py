@@ -38,7 +38,8 @@ class Bench:
             shown = self.count * round(self.shown / self.count) - counted
             self.trail.follow(command, shown, STEP_S, LAG_S)
             if self.trail.ends(self.count):
-                self.ended += self.trail.take(LAG_S, self.count)
+                self.ended += self.trail.due - self.trail.shown
+                self.trail.end(LAG_S, self.count)
             self.doubt = self.ended + self.trail.due - self.trail.shown
 
 

@@ -67,15 +67,15 @@ class Trail(Struct):
         size = max(abs(self.due), abs(self.shown))
         return self.disagrees(count) or size >= STEP_COUNTS * count or self.seconds >= STEP_S
 
-    def take(self, lag: Seconds, count: Rad, *, said: bool = True) -> Rad:
-        """End the step, and return what is in doubt now, as one standard deviation.
+    def end(self, lag: Seconds, count: Rad, *, said: bool = True) -> None:
+        """End the step, whose difference is in doubt as one standard deviation.
 
         Of a silence, nothing is `said`: the wheels may have obeyed another command in it.
         """
         more, disagrees, size = self.due - self.shown, self.disagrees(count), abs(self.due)
         if not said:
             self.due = self.shown = self.seconds = 0.0
-            return more
+            return
         keep = 1.0 / (1.0 + self.seconds / MEMORY_S) if size or self.shown else 1.0
         self.recent, self.fastest = keep * self.recent + size, keep * self.fastest
         self.short = keep * self.short + more
@@ -84,7 +84,6 @@ class Trail(Struct):
         most = SHARE * self.recent + (DELAY_S + lag) * self.fastest + COUNTS * count
         self.weak = abs(self.short) > (most / 2 if self.weak else most)
         self.differs |= min(abs(self.astray), abs(self.short)) > most
-        return more
 
     def restart(self, speed: RadPerS) -> None:
         """Note that nobody knows what is expected of a side with this speed."""
@@ -96,14 +95,19 @@ class Trail(Struct):
         self.weak = self.differs = False
 
 
-class Found(NamedTuple):
-    """Angles that the pose may have missed, rad."""
+class Step(NamedTuple):
+    """Angles of the sides that the pose may have missed in a step, rad."""
 
-    astray: Wheels4  # of the sides
-    margin: Wheels4  # of the sides, in a silence
-    silent: bool  # a silence may be the cause
-    open: Wheels4  # of the sides, in the open step: it replaces that of the last update
-    wheels: list[tuple[SideName, Wheels4]]  # of a side whose wheels contradict each other
+    astray: Wheels4 = AT_REST
+    margin: Wheels4 = AT_REST  # in a silence
+    silent: bool = False  # a silence may be the cause
+
+
+class Found(NamedTuple):
+    ended: Step
+    open: Step  # it replaces that of the last update
+    # Angles that the pose may have missed on a side whose wheels contradict each other, rad.
+    wheels: list[tuple[SideName, Wheels4]]
 
 
 class Doubts(Struct):
@@ -147,8 +151,7 @@ class Doubts(Struct):
     def update(self, wheels: Wheels, lag: Seconds, count: Rad) -> Found:
         """End the open lines, and return what is in doubt now."""
         s, rolled, used = self.seconds, self.rolled, self.used
-        astray, margin, silent = AT_REST, AT_REST, False
-        wheels_astray = list[tuple[SideName, Wheels4]]()
+        ended, wheels_astray = Step(), list[tuple[SideName, Wheels4]]()
         trails = (self.left, self.right)
         for trail, side, commanded in zip(trails, wheels.sides, self.commanded, strict=True):
             if s <= 0.0:
@@ -165,15 +168,19 @@ class Doubts(Struct):
                 wheels_astray.append((side.name, of_side(side.front, half)))
         # One side alone would be in doubt of a turn.
         if self.left.ends(count) or self.right.ends(count):
-            silent, self.silent = self.silent, False
-            left, right = (trail.take(lag, count, said=not silent) for trail in trails)
-            astray = right, left, left, right
-            (left, right), self.margin = self.margin, (0.0, 0.0)
-            margin = right, left, left, right
+            ended = self._step()
+            for trail in trails:
+                trail.end(lag, count, said=not self.silent)
+            self.silent, self.margin = False, (0.0, 0.0)
         self.commanded, self.seconds, self.unknown = (0.0, 0.0), 0.0, False
         self.rolled = self.used = AT_REST
-        left, right = (trail.due - trail.shown for trail in trails)
-        return Found(astray, margin, silent, (right, left, left, right), wheels_astray)
+        return Found(ended, self._step(), wheels_astray)
+
+    def _step(self) -> Step:
+        left, right = (trail.due - trail.shown for trail in (self.left, self.right))
+        of_left, of_right = self.margin
+        margin = of_right, of_left, of_left, of_right
+        return Step((right, left, left, right), margin, self.silent)
 
     def forget(self) -> None:
         """Forget all doubts: the pose was set."""

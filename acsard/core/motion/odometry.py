@@ -17,7 +17,7 @@ from msgspec import Struct, field
 
 from acsard.core.link.feedback import MAX_FILLED_GAP_S, Line
 from acsard.core.motion.consistency import ConsistencyChecks
-from acsard.core.motion.doubts import Doubts
+from acsard.core.motion.doubts import Doubts, Step
 from acsard.core.motion.gaps import AT_REST, LONG_S, Rolled, Skipped, plus, rolled_over, times
 from acsard.core.motion.gyro import REST_S
 from acsard.core.motion.kinematics import on_arc
@@ -185,16 +185,9 @@ class Odometry(Struct):
                 uncertainty.miss("gyro", 0.0, turn.doubt, heading)
             found = self.doubts.update(wheels, model.feedback.response_time, model.wheel_count)
             turns = 0.0 if turn is not None else 1.0
-            if found.astray != AT_REST:
-                distance, angle = model.kinematics.moved(found.astray)
-                of_way, of_turn = SILENT if found.silent else USUAL
-                uncertainty.miss(of_way, distance, 0.0, heading)
-                uncertainty.miss(of_turn, 0.0, turns * angle, heading)
-            if found.margin != AT_REST:
-                distance, angle = model.kinematics.moved(found.margin)
-                uncertainty.miss("silent range", distance, turns * angle, heading)
-            distance, angle = model.kinematics.moved(found.open)
-            uncertainty.miss_yet(distance, turns * angle, heading)
+            for missed in self._missed(found.ended, model, turns):
+                uncertainty.miss(*missed, heading)
+            uncertainty.set_open(self._missed(found.open, model, turns), heading)
             for side, angles in found.wheels:
                 distance, angle = model.kinematics.moved(angles)
                 uncertainty.miss(side, distance, turns * angle, heading)
@@ -202,6 +195,18 @@ class Odometry(Struct):
             line.at, self.pose, self.twist, uncertainty.covariance, uncertainty.twist,
             self.positions, speeds, line.asked_ns, line.heard_ns,
         )  # fmt: skip
+
+    @staticmethod
+    def _missed(step: Step, model: ErrorModel, turns: float) -> list[tuple[Missed, Metres, Rad]]:
+        found = list[tuple[Missed, Metres, Rad]]()
+        if step.astray != AT_REST:
+            distance, angle = model.kinematics.moved(step.astray)
+            of_way, of_turn = SILENT if step.silent else USUAL
+            found += [(of_way, distance, 0.0), (of_turn, 0.0, turns * angle)]
+        if step.margin != AT_REST:
+            distance, angle = model.kinematics.moved(step.margin)
+            found.append(("silent range", distance, turns * angle))
+        return found
 
     def _beyond_rocking(self, rolled: Wheels4, at_rest: bool, model: ErrorModel) -> Wheels4:
         # A wheel at rest may rock between the edges of a count.

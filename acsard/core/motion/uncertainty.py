@@ -16,6 +16,7 @@ that was missed, or a heading of which nothing is known, the robot may be anywhe
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from typing import Literal, get_args
 
 from msgspec import Struct, field
@@ -227,8 +228,8 @@ class Uncertainty(Struct):
     period: Seconds = ASSUMED_PERIOD_S
     in_play: Rad = 0.0  # heading from the middle of the play, within `ErrorModel.play`
     astray: Metres = 0.0  # standard deviation to all sides
-    # What the causes "way" and "turn" have beside `columns` until the next update.
-    yet: tuple[Vector, Vector] = ORIGIN, ORIGIN
+    # Motion that the pose may have missed in an open step, beside `columns`.
+    open: tuple[tuple[Missed, Vector], ...] = ()
 
     @classmethod
     def initial(cls, model: ErrorModel, pose: Pose) -> Uncertainty:
@@ -307,12 +308,12 @@ class Uncertainty(Struct):
             self._bend()
         self._publish()
 
-    def miss_yet(self, distance: Metres, turn: Rad, heading: Rad) -> None:
-        """Replace the motion that the pose may have missed in a step that has not ended."""
+    def set_open(self, missed: Iterable[tuple[Missed, Metres, Rad]], heading: Rad) -> None:
+        """Set what the pose may have missed in a step that has not ended: cause, distance, turn."""
         c, s = math.cos(heading), math.sin(heading)
-        yet = (c * distance, s * distance, 0.0), (0.0, 0.0, turn)
-        if yet != self.yet:
-            self.yet = yet
+        vectors = [(cause, (c * distance, s * distance, turn)) for cause, distance, turn in missed]
+        if vectors or self.open:
+            self.open = tuple(vectors)
             self._publish()
 
     def set_twist(
@@ -400,12 +401,11 @@ class Uncertainty(Struct):
         new.added = xx + mean_x * mean_x, xy + mean_x * mean_y, yy + mean_y * mean_y
 
     def _publish(self) -> None:
-        columns = self.columns
-        if self.yet != (ORIGIN, ORIGIN):
-            columns = [*columns]
-            for i, (x, y, yaw) in zip((MISSED["way"], MISSED["turn"]), self.yet, strict=True):
-                of_x, of_y, of_yaw = columns[i]
-                columns[i] = of_x + x, of_y + y, of_yaw + yaw
+        columns = [*self.columns] if self.open else self.columns
+        for cause, (x, y, yaw) in self.open:
+            i = MISSED[cause]
+            of_x, of_y, of_yaw = columns[i]
+            columns[i] = of_x + x, of_y + y, of_yaw + yaw
         p, (xx, xy, yy) = _total(self.p, columns), self.bend.added
         far = self.astray * self.astray
         p = PoseCovariance(p.xx + xx + far, p.xy + xy, p.xyaw, p.yy + yy + far, p.yyaw, p.yawyaw)
