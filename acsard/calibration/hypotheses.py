@@ -123,7 +123,8 @@ def examined(
 
 
 def _alternates(runs: Sequence[Run], base: Base) -> tuple[str, str]:
-    # What shows two IMUs, and what two programs that write the wheels, in blocks.
+    # Return the sentence about two IMUs, and that about two programs that write the wheels, if rows
+    # come from one or the other by turns. "" if they do not.
     found = [(np.zeros(0), np.zeros(0))]
     for run in runs:
         left, right = (np.gradient(side, run.t) for side in (run.left, run.right))

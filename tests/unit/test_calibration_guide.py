@@ -1,4 +1,4 @@
-"""Guided drives of simulated robots, with a person who measures what the truth is."""
+"""Guided drives of simulated robots, with a person who measures without an error."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
-"""What one sensor shows beside the wheels, and what follows from what the sensors show.
+"""Compares single sensors with the wheels, and draws conclusions from the comparisons.
 
-These are the signs, units and limits, on logs of 40 s. Whole logs with their causes are in
-`test_calibration_hypotheses.py`.
+The logs last 40 s, and the tests are about signs, units and limits. Whole logs with their causes
+are in `test_calibration_hypotheses.py`.
 """
 
 from __future__ import annotations
@@ -157,7 +157,7 @@ def test_the_bias_of_a_gyro_is_the_rate_at_rest() -> None:
     assert gyro_bias([log("gyro").part(3.0, 30.0)]) == (0.0, 0.05)  # it never rests
 
 
-# what follows from what the sensors show
+# conclusions
 
 GIVEN = {sensor: Match(sensor, 0.02, 1.5, 0.0, 0.02) for sensor in hypotheses.NAMES}
 

@@ -1,6 +1,6 @@
-"""What a guided drive does and asks, and what a result says, have approved words.
+"""The legs and the questions of a guided drive, and the sentences of a result, are approved texts.
 
-A person drives a robot by the legs, and decides by the sentences. So each changed number is read.
+A person drives and decides by them, so a change of a number in them must be read.
 """
 
 from __future__ import annotations
