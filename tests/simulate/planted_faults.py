@@ -33,7 +33,6 @@ PLANS_OF_FAULT = {
     "wheel stuck": "stuck encoder", "counts wrong": "wrong counts",
     "session gap": "mute", "session stale": "mute", "odometry silent": "mute",
     "odometry gap": "mute", "odometry lone": "flip", "sanity pause": "flip",
-    "counts forgotten": "wrong counts",
     "loop end": "restart", "robot end": "restart", "gate late": "stall in step",
     "session echo": "half_duplex", "session set points": "ideal board", "case 11": "echo",
     "limits clock": "wall",
@@ -418,8 +417,6 @@ FAULTS = (
           "passed < math.inf"),
     fault("wheel silence", "what was smoothed before a long silence is motion behind it",
           "core/motion/wheels.py", "                wheel.stand()\n", "                pass\n"),
-    fault("counts forgotten", "the way there and back refutes wrong counts",
-          "core/link/board_counts.py", "        full = full and (known or over > 1.0)\n", ""),
     fault("doubts more", "what the wheels did otherwise is in doubt three times",
           "core/motion/doubts.py", "        return Step((right, left, left, right), margin",
           "        left, right = 3.0 * left, 3.0 * right\n"

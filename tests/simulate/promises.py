@@ -160,6 +160,8 @@ class Witness:
         self.ending_ns: int | None = None
         """When the daemon got SIGTERM."""
         self.fault_ns: int | None = None
+        self.perhaps_fault_ns: int | None = None
+        """Time of a fault that the next daemon may have latched still, or not."""
         self.faults: list[int] = []
         """Times of the causes of the fault that no clear has released, as the log names them."""
         self.mode_ns = 0
@@ -451,7 +453,7 @@ class Witness:
                 self.stops = [at_ns for at_ns in self.stops if at_ns > arrived_ns]
                 self.faults = [at_ns for at_ns in self.faults if at_ns > arrived_ns]
                 if self.fault_ns is not None and self.fault_ns <= arrived_ns:
-                    self.fault_ns = None
+                    self.perhaps_fault_ns, self.fault_ns = self.fault_ns, None
             case "activate":
                 self.offs = [at_ns for at_ns in self.offs if at_ns > arrived_ns]
 
@@ -461,11 +463,13 @@ class Witness:
         self.stops.clear()
         self.offs.clear()
         self.faults.clear()
+        self.perhaps_fault_ns = self.fault_ns or self.perhaps_fault_ns
         self.fault_ns = None
 
     def file_is_damaged(self, at_ns: int) -> None:
         """Note that a daemon cannot read the latch file, so it starts stopped."""
         self.file_is_behind()
+        self.perhaps_fault_ns = None
         self.stops.append(at_ns)
 
     # the steps and lines of the daemon
@@ -505,10 +509,11 @@ class Witness:
             if self.mode and self.fault_ns is None and not caused:
                 raise BrokenError("no fault without a cause", at_ns, f"{reason} (board: {recent})")
             if self.fault_ns is None:
-                self.fault_ns = at_ns
+                self.fault_ns = self.perhaps_fault_ns or at_ns
         if mode != self.mode:
             self.counts[f"mode {mode}"] += 1
             self.mode_ns = at_ns
+        self.perhaps_fault_ns = None
         self.mode, self.code, self.reason, self.source = mode, code, reason, source
 
     @property

@@ -50,7 +50,7 @@ class Version(NamedTuple):
 
     @property
     def env(self) -> dict[str, str]:
-        return environment(PYTHONPATH=str(self.source), XDG_STATE_HOME=str(self.where))
+        return environment(PYTHONPATH=str(self.source), STATE_DIRECTORY=str(self.where))
 
     def daemon(self, port: Path | str = "sim") -> Daemon:
         """Return its daemon. With a real port, it keeps its latches for the next one."""
