@@ -193,9 +193,11 @@ def runaway(replies: Sequence[BoardReply], most: float = RUNAWAY_SPEED) -> tuple
     # interval shows a runaway motor sooner, and a longer interval shows it even with a coarse
     # encoder.
     for span_s in (SHORT_MEASUREMENT_S / 2, SHORT_MEASUREMENT_S) if replies else ():
-        near = since(replies, replies[-1].at_s - span_s)
-        course = list(steps(max(near, replies[-4:], key=len)))
-        for motor in range(len(replies[-1].motors)):
+        near = max(since(replies, replies[-1].at_s - span_s), replies[-4:], key=len)
+        # No mean is above the largest speed.
+        fast = {motor for reply in near for motor in moving(reply.motors, most)}
+        course = list(steps(near)) if fast else []
+        for motor in sorted(fast):
             pieces = [
                 (min(SHORT_MEASUREMENT_S, step.seconds), step.speeds[motor]) for step in course
             ]

@@ -437,7 +437,8 @@ def test_a_robot_that_never_turns_shows_no_track() -> None:
 
 
 def test_errors_of_turns_are_those_of_the_configured_track() -> None:
-    spins = motion([(2, 0, 0), (12, 0.2, 0.8), (2, 0, 0), (12, 0.2, -0.8), (2, 0, 0)])
+    # By the configured track, each turn is wrong by more than half a turn.
+    spins = motion([(2, 0, 0), (20, 0.2, 0.8), (2, 0, 0), (20, 0.2, -0.8), (2, 0, 0)])
     for sensor in ("gyro", "headings"):
         for multiplier in (1.0, 2.0):
             config = Config(drive=DriveConfig(wheel_separation_multiplier=multiplier))

@@ -399,6 +399,9 @@ def test_the_cause_that_ends_a_guided_drive_is_named(monkeypatch: pytest.MonkeyP
     robot.answers["info"] = SimpleNamespace(simulated=False)
     with pytest.raises(UsageError, match="--yes is only for the built-in simulator"):
         robot.drive(monkeypatch, Options(without_person=True))
+    robot.disturbs = raises(NotDrivenError("a reason"))
+    with pytest.raises(NotDrivenError, match="a reason"):  # a person drives a real robot
+        robot.drive(monkeypatch, Options())
     robot = Rides()
     robot.answers["config"] = {"drive": {"wheel_radius": "a"}}
     with pytest.raises(LogError, match=r"cannot read .* use the daemon's version, 1\.2"):

@@ -93,6 +93,8 @@ def test_the_lines_at_the_start_name_each_page_and_the_manual_that_it_serves() -
     assert list(web.places([wished], [wished], "", with_manual=False)) == [
         "page ready  http://127.0.0.1:8080/"
     ]
+    *_, manual = web.places([wished, other], [wished, other], "", with_manual=True)
+    assert manual == "manual      http://127.0.0.1:8080/docs"
     page, manual = web.places([other], [wished], "", with_manual=True)
     assert page.startswith("page ready  http://127.0.0.1:8081/  (instead of http://127.0.0.1:8080/")
     assert manual == "manual      http://127.0.0.1:8081/docs"

@@ -55,6 +55,9 @@ def test_the_newest_recording_is_exported_to_a_named_file_in_the_working_directo
     output = capsys.readouterr()
     assert output.err == ""  # without a terminal there is no progress line
     assert output.out.endswith(f" in {name}\n")
+    if words:
+        (rows,) = re.findall(r"(\d+) rows", output.out)
+        assert int(rows) == len((here / name).read_text().splitlines()) - 1
     assert [path.name for path in here.iterdir()] == [name]
 
 

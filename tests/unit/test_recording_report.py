@@ -300,8 +300,17 @@ def test_the_bands_say_who_drives_and_why_another_waits() -> None:
     assert 0.2 * seconds < sum(drives["x"]) / 1000 <= seconds
     texts = dict(zip(waits["y"], waits["hovertext"], strict=True))
     assert "teleop has priority" in texts["nav"].replace("<br>", " ")
-    modes = {t["name"] for t in pictures(text)["time"]["data"] if "mode" in t["y"]}
-    assert modes >= {"driving", "stopped"}
+    bars = [trace for trace in pictures(text)["time"]["data"] if trace["type"] == "bar"]
+    assert all(bar["name"] for bar in bars)
+    shown = [bar for bar in bars if "mode" in bar["y"]]
+    assert {bar["name"] for bar in shown} >= {"driving", "stopped"}
+    spans = sorted(
+        (base, base + x)
+        for bar in shown
+        for y, base, x in zip(bar["y"], bar["base"], bar["x"], strict=True) if y == "mode"
+    )  # fmt: skip
+    for (_, end), (begin, _) in pairwise(spans):
+        assert begin == pytest.approx(end, abs=1.0)
 
 
 def test_a_phone_has_room_for_the_words_and_a_round_shows_its_start() -> None:

@@ -148,3 +148,7 @@ def test_a_robot_of_another_layout_is_replaced_by_a_fresh_one_where_it_rests(
     recorded, replayed = playback.comparison.end or ((0, 0, 0), (1, 1, 1))
     assert recorded == pytest.approx(replayed, abs=1000)
     assert playback.robot.state.odometry.pose.x > 0.8
+    other = replace(Config(), limits=replace(Config().limits, angular_speed=0.3))
+    playback = Playback(recording, other)
+    next(playback.steps())
+    assert playback.robot.config == other
