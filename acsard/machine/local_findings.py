@@ -155,9 +155,9 @@ def serial_port(path: str, simulated: bool) -> Iterator[Finding]:
 
 
 def _hardware(name: str) -> Iterator[Finding]:
-    usb = [port for port in serial_devices() if port.device == f"/dev/{name}"]
-    if usb and usb[0].usb_id and not usb[0].board:
-        yield finding("port_unknown_board", usb=usb[0].usb_id, known=", ".join(sorted(BOARDS)))
+    for port in serial_devices():
+        if port.device == f"/dev/{name}" and port.usb_id and not port.board:
+            yield finding("port_unknown_board", usb=port.usb_id, known=", ".join(sorted(BOARDS)))
     timer = Path(f"/sys/class/tty/{name}/device/latency_timer")
     if timer.is_file() and timer.read_text().strip() != "1":
         yield finding("port_slow", timer=timer.read_text().strip(), file=timer)

@@ -20,6 +20,7 @@ from collections.abc import Collection, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from filecmp import cmp
 from importlib.metadata import Distribution, PackageNotFoundError, distribution
+from itertools import count
 from pathlib import Path
 
 import acsard
@@ -199,10 +200,8 @@ def _names() -> Iterator[str]:
     name = own.version()
     yield name
     separator = "." if "+" in name else "+"
-    number = 2
-    while True:
+    for number in count(2):
         yield f"{name}{separator}{number}"
-        number += 1
 
 
 def is_own(name: str) -> bool:

@@ -166,6 +166,7 @@ def test_what_wrong_counts_moved_is_the_same_doubt_with_any_wiring() -> None:
     assert swapped == pytest.approx(covariance(WheelMap()))
 
 
+@pytest.mark.variations(2)
 @pytest.mark.parametrize("configured", [100, 400])
 def test_lines_are_not_judged_by_counts_that_are_wrong(configured: int) -> None:
     robot = world(20, "on", configured)
@@ -185,7 +186,7 @@ def test_right_counts_are_used_from_the_first_second_of_driving() -> None:
     assert robot.state.pose_doubt == ""
 
 
-@pytest.mark.variations(4)
+@pytest.mark.variations(8)
 @pytest.mark.parametrize("counts", [16, 96])
 @pytest.mark.parametrize("configured", [True, False])
 @four_and_two
@@ -200,6 +201,7 @@ def test_a_coarse_encoder_on_a_plain_link_that_loses_replies_advises_the_checked
     assert 'mcu.link_check = "on"' in event.text
 
 
+@pytest.mark.variations(2)
 @pytest.mark.parametrize("counts", [16, 96])
 def test_a_coarse_encoder_behind_an_adapter_of_16_ms_advises_the_checked_link(counts: int) -> None:
     robot = world(counts)

@@ -191,6 +191,7 @@ def test_a_robot_that_was_unplugged_for_long_drives_on_and_its_pose_can_be_set(
     assert world.odom.pose.covariance[0] < 1e-4
 
 
+@pytest.mark.variations(4)
 @pytest.mark.parametrize("link_check", ["off", "on"])
 @pytest.mark.parametrize("speed", [(0.4, 0.0), (-0.4, 0.0), (0.0, 1.5)])
 def test_the_doubt_of_a_long_silence_in_a_drive_is_bounded(

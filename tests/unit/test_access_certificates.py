@@ -110,6 +110,9 @@ def test_a_file_in_the_place_of_the_directory_is_named(
     for below in ("tls", "tls/robot"):
         assert tls("init", "--directory", str(tmp_path / below)) == 1
         assert f"{tmp_path / 'tls'} is not a directory; name a" in capsys.readouterr().err
+    (tmp_path / "link").symlink_to("missing")
+    assert tls("init", "--directory", str(tmp_path / "link" / "robot")) == 1
+    assert f"{tmp_path / 'link'} is not a directory; name a" in capsys.readouterr().err
 
 
 @each(
@@ -144,7 +147,8 @@ def test_the_authority_signs_certificates_and_nothing_below_it_does(made: Path) 
         issued.verify_directly_issued_by(authority)
         assert certificate(made / place, "ca.pem") == authority
         assert common_name(issued.subject) == name
-        assert not extensions.get_extension_for_class(x509.BasicConstraints).value.ca
+        basic = extensions.get_extension_for_class(x509.BasicConstraints)
+        assert (basic.critical, basic.value.ca) == (True, False)
         own = extensions.get_extension_for_class(x509.KeyUsage)
         assert (own.value.key_cert_sign, own.value.digital_signature) == (False, True)
         assert own.critical

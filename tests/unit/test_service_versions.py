@@ -61,6 +61,8 @@ def test_a_newer_version_that_is_not_in_use_is_found(tmp_path: Path) -> None:
     assert versions.unused(tmp_path) == ""
     versions.use("0.2.0", tmp_path)
     assert versions.unused(tmp_path) == "0.3.0"
+    versions_in(tmp_path, "0.1.0")
+    assert versions.unused(tmp_path) == "0.3.0"
 
 
 def test_the_newest_version_has_the_highest_number_not_the_latest_files(tmp_path: Path) -> None:
@@ -172,8 +174,11 @@ def test_a_version_that_is_installed_is_named_by_its_directory(
     monkeypatch.setattr(versions, "HOME", tmp_path)
     monkeypatch.setattr(versions.installed, "__defaults__", (tmp_path,))
     assert prepare(tmp_path / "0.3.0") == "0.3.0"
-    with pytest.raises(MendableError, match="neither a"):
-        prepare(tmp_path / "0.4.0")
+    namesake = tmp_path / "venvs" / "0.3.0"
+    namesake.mkdir(parents=True)
+    for other in (tmp_path / "0.4.0", namesake):
+        with pytest.raises(MendableError, match="neither a"):
+            prepare(other)
 
 
 def test_only_a_package_or_an_environment_is_a_new_version(tmp_path: Path) -> None:
