@@ -51,10 +51,14 @@ def test_counts_per_turn_are_measured_over_wraps_of_clock_and_counts(
 
 
 @each(
-    ("share", "words"),
-    [(-1.0, "motor b (front left) run against"), (0.0, "do not change"), (2.0, "do not agree")],
+    ("share", "words", "figure"),
+    [
+        (-1.0, "motor b (front left) run against", "-3200 per turn"),
+        (0.0, "do not change", "0 per turn"),
+        (2.0, "do not agree", "a 3200, b 6400 per turn"),
+    ],
 )
-def test_wrong_counts_of_one_motor_are_found(share: float, words: str) -> None:
+def test_wrong_counts_of_one_motor_are_found(share: float, words: str, figure: str) -> None:
     with Robot().board() as board:
         board.sampled = True
         board.replies = []
@@ -66,7 +70,7 @@ def test_wrong_counts_of_one_motor_are_found(share: float, words: str) -> None:
             reading = Reading(reply.reading.mcu_ms, counts)
             board.replies.append(BoardReply(reply.at_s, motors, b"", reading))
         finding = encoder_counts.finding(board, [0, 1])
-    assert (finding.verdict, finding.keys) == ("FAIL", {})
+    assert (finding.verdict, finding.figure, finding.keys) == ("FAIL", figure, {})
     assert words in finding.text
 
 

@@ -67,6 +67,11 @@ def test_a_failed_edit_changes_nothing(tmp_path: Path, monkeypatch: pytest.Monke
             change(file, {"mcu.baud_rate": wish})
         monkeypatch.setattr("tomlkit.parse", fails)
     assert file.read_text() == "[mcu]\n"
+    monkeypatch.undo()
+    file.write_bytes(b"# caf\xe9\n")  # by an editor that does not write UTF-8
+    with pytest.raises(MendableError, match="was not changed"):
+        change(file, KEYS)
+    assert file.read_bytes() == b"# caf\xe9\n"
     assert os.listdir(tmp_path) == ["acsard.toml"]
 
 
