@@ -20,6 +20,7 @@ from acsard.core.config.settings import Config, McuConfig, WheelMap
 from acsard.core.config.simulated_faults import parse
 from acsard.core.simulator.fake_mcu import FakeMcu
 from acsard.core.simulator.virtual_wire import VirtualWire
+from acsard.core.values import NS_PER_S
 
 MS = 1_000_000
 
@@ -42,6 +43,7 @@ class Robot(VirtualWire):
         super().__init__(FakeMcu(self.built))
         self.faults = faults
         self.sent: list[bytes] = []
+        self.sent_s: list[float] = []
         self.turned: dict[int, bool] = {}
         """Maps each wheel that turned since the last clear to whether it first turned forward."""
         self.opened: list[int] = []
@@ -52,6 +54,7 @@ class Robot(VirtualWire):
 
     def send(self, data: bytes) -> None:
         self.sent.append(data)
+        self.sent_s.append(self.now_ns() / NS_PER_S)
         for wheel, speed in enumerate(self.mcu.vehicle.speeds):
             if abs(speed) > 1.0:
                 self.turned.setdefault(wheel, speed > 0)

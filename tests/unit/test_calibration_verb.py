@@ -60,7 +60,7 @@ def test_write_keeps_the_comments_and_a_second_time_finds_nothing_to_improve(
     for key, value in result["settings"].items():
         section, _, name = key.partition(".")
         assert getattr(getattr(config, section), name) == value
-    with pytest.raises(MendableError, match=r"agrees with\sits\sconfiguration: nothing") as end:
+    with pytest.raises(MendableError, match=r"agrees\swith\sits\sconfiguration: nothing") as end:
         called(tmp_path, GOOD, "--json", "--write", text=text)
     assert end.value.code == Exit.FAILURE
     assert max(map(len, str(end.value).splitlines())) <= MAX_TEXT_WIDTH

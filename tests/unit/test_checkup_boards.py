@@ -9,6 +9,8 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
+from itertools import groupby
+from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
@@ -253,6 +255,39 @@ def test_the_check_names_each_fault_and_nothing_else(
         text += "".join(f"{line}\n" for line in (f"== {name}", *says.new(checked.findings)))
         text += "".join(f"        {key} = {value!r}\n" for key, value in checked.changes.items())
     approved(WORDS / f"checkup_{page}.txt", text)
+
+
+GOOD = re.compile(rb"([a-z][pn]\d\d\.\d\d,?)+#?\r\n")
+
+
+def sent_to(robot: Robot) -> str:
+    """Return what the board got, a row for equal lines or for a ramp: time, number and lines."""
+    lines = (re.sub(rb"#\S+", b"#", line) for line in robot.sent)  # without number and checksum
+    series = [
+        [*same] for _, same in groupby(zip(robot.sent_s, lines, strict=True), key=itemgetter(1))
+    ]
+    text = ""
+    for ramp, parts in groupby(
+        series, key=lambda same: len(same) == 1 and bool(GOOD.fullmatch(same[0][1]))
+    ):
+        rows = [*parts]
+        for row in [[one for same in rows for one in same]] if ramp else rows:
+            (at_s, first), (_, last) = row[0], row[-1]
+            until = f" to {last!r}" if last != first else ""
+            text += f"{at_s:7.2f} {len(row):4} {first!r}{until}\n"
+    return text
+
+
+@each(
+    ("name", "faults", "how"),
+    [("plain", ["plain_only"], {"config": TWO_WHEELS}), ("checked", [], {"encoder_counts": 3200})],
+)
+def test_the_check_sends_the_lines_that_a_person_has_read(
+    name: str, faults: list[str], how: dict[str, Any], approved: Callable[[Path, str], None]
+) -> None:
+    robot = Robot(*faults, **how)
+    Checked(robot)
+    approved(WORDS / f"checkup_sent_{name}.txt", sent_to(robot))
 
 
 class Leaves(Nobody):
