@@ -50,18 +50,19 @@ class Frozen(Struct):
     layout: int = 0  # `LAYOUT` of the version that wrote it
 
 
-def _layout() -> int:
-    # All fields with their types. A description is no difference.
+def layout_of(kind: type[Struct]) -> int:
+    """Return a number of all fields with their types. A description is no difference."""
+
     def bare(item: object) -> object:
         if isinstance(item, dict):
             return {key: bare(value) for key, value in item.items() if key != "description"}
         return [bare(value) for value in item] if isinstance(item, list | tuple) else item
 
-    schema = msgspec.json.schema(State)
+    schema = msgspec.json.schema(kind)
     return zlib.crc32(msgspec.json.encode(bare(schema), order="deterministic"))
 
 
-LAYOUT = _layout()
+LAYOUT = layout_of(State)
 
 
 def freeze(robot: Robot, memory: Memory) -> bytes:

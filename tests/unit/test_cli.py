@@ -60,6 +60,7 @@ def helped(known: argparse.ArgumentParser, path: str) -> Iterator[str]:
     yield from filter(None, (known.description, known.epilog))
     for action in known._actions:
         if isinstance(action, argparse._SubParsersAction):
+            yield from (f"{one.dest}: {one.help}" for one in action._choices_actions)
             for name, below in action.choices.items():
                 yield from helped(below, f"{path} {name}")
         elif action.help not in ("show this help message and exit", argparse.SUPPRESS):

@@ -28,6 +28,7 @@ from acsard.recording.state import (
     MAX_BYTES,
     StateError,
     freeze,
+    layout_of,
     thaw,
 )
 from tests.each import each
@@ -124,6 +125,17 @@ def test_a_state_with_a_configuration_that_a_file_may_not_have_is_refused() -> N
     robot.config = replace(PLAIN, limits=replace(PLAIN.limits, linear_deceleration=0.11))
     with pytest.raises(StateError, match=r"limits\.linear_deceleration = 0\.11"):
         thaw(freeze(robot, Memory()))
+
+
+def test_another_field_or_type_is_another_layout() -> None:
+    kinds = [
+        msgspec.defstruct("Wheel", [("speed", float)]),
+        msgspec.defstruct("Wheel", [("speed", int)]),
+        msgspec.defstruct("Wheel", [("speed", float), ("turn", float)]),
+    ]
+    described = msgspec.defstruct("Wheel", [("speed", float)], namespace={"__doc__": "A wheel."})
+    assert len({layout_of(kind) for kind in kinds}) == 3
+    assert layout_of(described) == layout_of(kinds[0])
 
 
 def test_a_robot_of_another_layout_is_replaced_by_a_fresh_one_where_it_rests(
