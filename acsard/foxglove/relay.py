@@ -46,23 +46,12 @@ class EventDeduplicator:
         After a restart of the daemon all events are new; if the wall clock was also set back, some
         may be left out.
         """
-        known, previous, stamp_ns = self._total, self._reported, events.stamp.to_ns()
-        before_ns = self._stamp_ns
-        if events.total < known:
-            if stamp_ns <= self._stamp_ns:
-                return []  # an older answer that arrived after a published list
-            known, previous = 0, []  # the daemon was restarted
-        self._total, self._stamp_ns, self._reported = events.total, stamp_ns, events.events
-        first = len(events.events) - min(events.total - known, len(events.events))
-        # The number of new events is wrong if the daemon was restarted and has logged at least as
-        # many events as before, so also use the times. Times alone are not enough, because the
-        # clock may be set back. An event that lasts counts several times in the total but appears
-        # once in the list.
-        return [
-            log(event, event.stamp)
-            for place, event in enumerate(events.events)
-            if (place >= first or event.stamp.to_ns() > before_ns) and event not in previous
-        ]
+        stamp_ns = events.stamp.to_ns()
+        if events.total < self._total and stamp_ns <= self._stamp_ns:
+            return []  # an older answer that arrived after a published list
+        previous, self._reported = self._reported, events.events
+        self._total, self._stamp_ns = events.total, stamp_ns
+        return [log(event, event.stamp) for event in events.events if event not in previous]
 
 
 class _Out:

@@ -53,7 +53,6 @@ EQUIVALENT: dict[str, str] = {
     "acsard/client/connection.py _CommandSpacing.__init__: '_s = (threading.RLock(), 0.0, 0.0)' -> '_s = (threading.RLock(), 0.0, -1.0)'": "the monotonic clock is above both",
     "acsard/client/ride.py Ride.due: 'if now - self._opened >= OPEN_TIMEOUT_S:' -> 'if now - self._opened > OPEN_TIMEOUT_S:'": "times that are measured in ns are never equal",
     "acsard/foxglove/bridge.py Bridge.__init__: 'self._retry_s = 0.0' -> 'self._retry_s = 1.0'": "the monotonic clock is above both",
-    "acsard/foxglove/relay.py EventDeduplicator.of: 'known, previous = (0, [])' -> 'known, previous = (-1, [])'": "a total is never below the number of its events",
     "acsard/recording/file.py encode_steps: '), replace(heard, received=()) if reads else heard, driven, line, sent, trip, la' -> '), replace(heard, received=()), driven, line, sent, trip, la'": "without reads it replaces an empty tuple by an empty tuple",
     "acsard/recording/recorder.py Recorder._watch_disk: 'elif self._waited_ns > SLOW_DISK_NS:' -> 'elif self._waited_ns >= SLOW_DISK_NS:'": "times that are measured in ns are never equal",
     "acsard/recording/recorder.py _Writer.__init__: 'self._number = 0' -> 'pass'": "`_begin` sets it before the first step",

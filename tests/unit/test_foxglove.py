@@ -239,6 +239,11 @@ def test_the_service_that_stops_the_robot_answers_also_without_a_robot(
     robot: Any = Mock(call=Mock(return_value=ServiceReply(True, "stopped"), side_effect=error))
     service = stop_service(robot, RosConfig(namespace=namespace))
     assert service.name == name
+    request, response = service.schema.request, service.schema.response
+    assert request is not None
+    assert response is not None
+    assert request.schema.name == "std_srvs/srv/Trigger_Request"
+    assert {"success", "message"} <= json.loads(response.schema.data)["properties"].keys()
     reply = json.loads(service.handler(cast(Any, None)))
     robot.call.assert_called_once_with("stop")
     assert (reply["success"], reply["message"]) == (
