@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import re
+
+import pytest
+
 from acsard.checkup import least_speed
 from acsard.core.config.settings import Config, SimConfig
 from tests.each import each
@@ -29,7 +33,8 @@ def test_the_least_speed_is_measured_and_the_motors_stand_afterwards(
         assert max(map(abs, robot.mcu.vehicle.speeds)) < 0.1
     assert (found.verdict.rstrip("?"), found.figure) == (verdict, figure)
     if verdict == "WARN":
-        assert "m/s" in found.text
+        (speed, linear) = map(float, re.findall(r"([\d.]+) (?:rad|m)/s", found.text)[:2])
+        assert linear == pytest.approx(0.05 * speed, abs=0.005)
 
 
 @each("counts", [16, 20, 48])

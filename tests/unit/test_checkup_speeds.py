@@ -67,6 +67,9 @@ def test_the_speeds_up_to_that_of_the_limits_are_compared(
             assert motor_name(board.mcu, motor) in found.text
     if code == "top_speed_overflow":
         assert "10.0 rad/s" in found.text
+    said = found.text + found.mend
+    for speed, linear in re.findall(r"([\d.]+) rad/s, which is ([\d.]+) m/s", said):
+        assert float(linear) == pytest.approx(0.05 * float(speed), abs=0.01)
 
 
 def fastest(robot: Robot) -> float:
