@@ -198,6 +198,9 @@ def test_a_daemon_with_the_simulator_has_no_port_and_may_keep_its_values_secret(
     found = codes(examine("x", b"", {}))
     assert "port_simulated" not in found
     assert found[-1:] == [code] or not code
+    texts = [finding.text for finding in examine("x", b"[limits]\nlinear_speed = 0.3\n", {})]
+    daemon = f"limits.linear_speed = {FILE.limits.linear_speed}, not 0.3"
+    assert any(daemon in text for text in texts) is (config is not None)
 
 
 @pytest.mark.parametrize(("robot", "judged"), [("acsar", True), ("robot1", False)])
@@ -239,7 +242,7 @@ def test_six_values_that_differ_are_named_and_the_number_of_the_others(
 
 @pytest.mark.parametrize(
     ("ahead_s", "trip_s", "words"),
-    [(0.3, 0.0, ""), (-0.8, 1.0, ""), (-2.0, 1.0, "2.0 s behind"), (3600.0, 0.0, "s ahead of")],
+    [(0.3, 0.0, ""), (-0.8, 1.0, ""), (-2.0, 1.0, " 2.0 s behind"), (3600.0, 0.0, "s ahead of")],
 )
 def test_a_clock_is_wrong_if_a_late_answer_does_not_explain_it(
     ahead_s: float, trip_s: float, words: str
