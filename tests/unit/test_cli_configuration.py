@@ -288,3 +288,13 @@ def test_without_a_file_the_defaults_are_printed_and_are_no_mistake(
     result = typed("check")
     assert (result.code, result.err) == (0, f"{DEFAULTS}: no mistakes, no warnings")
     assert result.out.startswith(f"# effective configuration from {DEFAULTS}\n")
+
+
+def test_the_command_from_afar_has_the_address_to_which_this_terminal_is_logged_in(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.delenv("SSH_CONNECTION", raising=False)
+    assert run._login() == ""
+    monkeypatch.setenv("SSH_CONNECTION", "192.0.2.9 50000 192.0.2.7 22")
+    monkeypatch.setenv("USER", "pi")
+    assert run._login() == "pi@192.0.2.7"
