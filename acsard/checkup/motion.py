@@ -194,7 +194,7 @@ def runaway(replies: Sequence[BoardReply], most: float = RUNAWAY_SPEED) -> tuple
     # encoder.
     for span_s in (SHORT_MEASUREMENT_S / 2, SHORT_MEASUREMENT_S) if replies else ():
         near = max(since(replies, replies[-1].at_s - span_s), replies[-4:], key=len)
-        # No mean is above the largest speed.
+        # No mean of speeds in replies is above the largest one.
         fast = {motor for reply in near for motor in moving(reply.motors, most)}
         course = list(steps(near)) if fast else []
         for motor in sorted(fast):

@@ -41,10 +41,10 @@ class EventDeduplicator:
         self._reported: list[LogEvent] = []
 
     def of(self, events: Events) -> list[Log]:
-        """Return a log message for each event that was in no earlier list.
+        """Return a log message for each event that the list before did not have.
 
-        After a restart of the daemon all events are new; if the wall clock was also set back, some
-        may be left out.
+        A repetition of an event has a new time and is at the end of its list. After a restart of
+        the daemon with a clock that was set back, some events may be left out.
         """
         stamp_ns = events.stamp.to_ns()
         if events.total < self._total and stamp_ns <= self._stamp_ns:

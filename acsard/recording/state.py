@@ -51,7 +51,7 @@ class Frozen(Struct):
 
 
 def layout_of(kind: type[Struct]) -> int:
-    """Return a number of all fields with their types. A description is no difference."""
+    """Return a checksum of all fields with their types; descriptions do not count."""
 
     def bare(item: object) -> object:
         if isinstance(item, dict):
